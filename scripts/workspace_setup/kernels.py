@@ -38,6 +38,7 @@ def _track() -> None:
     # The first image is searched in full, in the next tags are where they were.
     for stamp in (0.0, 0.03):
         tracker.observe(picture, stamp)
+    straight.at(0.1)
 
 
 def _fitted(limb: Limb) -> Limb:

@@ -22,6 +22,7 @@ setup(
         "setuptools",
         "numpy",
         "numba",
+        "scipy",
         "opencv-python-headless",
         "PyYAML",
         "matplotlib",
@@ -36,6 +37,8 @@ setup(
         "console_scripts": [
             "apriltag_tracker = apriltag_tracker.entry:apriltag_tracker",
             "synthetic_camera = apriltag_tracker.entry:synthetic_camera",
+            "pose_tracker = apriltag_tracker.entry:pose_tracker",
+            "synthetic_poses = apriltag_tracker.entry:synthetic_poses",
         ],
     },
 )

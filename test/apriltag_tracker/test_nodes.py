@@ -163,3 +163,30 @@ def test_a_source_without_calibration_ends_the_node_with_the_remedy(graph):
     graph.client.wait_for(lambda: not tracker.alive, PATIENCE, "the end of the node")
     assert tracker.exit_code == 1
     assert "calibration_file" in tracker.last_words(20)
+
+
+def test_poses_of_motion_capture_become_the_tip(graph, states, config, tags, tmp_path):
+    """The poses come in millimetres and with y up, some are lost."""
+    body_map = tmp_path / "bodies.yaml"
+    text = (config / "bodies.yaml").read_text()
+    text = text.replace("length_unit: m ", "length_unit: mm ").replace("up: z", "up: y")
+    body_map.write_text(text)
+    mapped = {"body_map": str(body_map)}
+    mocap = graph.start("apriltag_tracker", "synthetic_poses", dropout=0.02, **mapped)
+    tracker = graph.start("apriltag_tracker", "pose_tracker", **mapped)
+    client = graph.client
+    client.watch([mocap, tracker])
+    stream = ShapeStream(graph, tags)
+    client.wait_for(lambda: sum(state.valid for state in states) > 45, PATIENCE, "valid states")
+    client.wait_ready(["synthetic_poses", "pose_tracker"])
+    valid = [state for state in states if state.valid and state.tags_used == len(tags.limb)]
+    errors = [
+        np.array([state.tip.x, state.tip.y]) - stream.truth[nanoseconds(state.header.stamp)]
+        for state in valid
+    ]
+    # Noise of 0.1 mm, and stiff stretches of the map that these arcs have not.
+    assert np.sqrt(np.mean(np.sum(np.square(errors), axis=1))) < 5e-4
+    told = client.wait_for(
+        lambda: client.diagnostic_values("pose_tracker").get("plane_tilt_deg"), PATIENCE, "a plane"
+    )
+    assert float(told) < 1.0

@@ -7,7 +7,8 @@ import pytest
 
 from apriltag_tracker.camera import pinhole
 from apriltag_tracker.detection import Detector, codes, edges
-from apriltag_tracker.pipeline import LimbTracker, TrackerOptions, Uncertainty, warm_up
+from apriltag_tracker.pipeline import LimbTracker, TrackerOptions, warm_up
+from apriltag_tracker.pose.following import Uncertainty
 from apriltag_tracker.synthetic.camera import Errors, Optics, SyntheticCamera
 
 pytestmark = pytest.mark.slow
@@ -120,7 +121,7 @@ def test_tags_at_another_height_or_place_are_left_out_by_name(straight_tags, mod
     observation = tracker.observe(camera.frame(swing.shape(0.3)).image, 0.0)
     assert observation.estimate.tags_used == (0, 2, 4)
     assert "wrong place, left out: 1" in observation.reason
-    assert tracker.misplaced == 1
+    assert tracker.follower.misplaced == 1
     error = observation.estimate.tip - swing.shape(0.3).points[-1]
     assert np.hypot(*error) < 1e-3
 

@@ -6,7 +6,8 @@ from waiting import Clock
 
 from apriltag_tracker.camera import project
 from apriltag_tracker.pipeline import LimbObservation, LimbTracker
-from apriltag_tracker.reports import ImageWatch, StampGaps, draw_observation
+from apriltag_tracker.reports import ImageWatch, draw_observation
+from apriltag_tracker.watching import StampGaps
 
 PERIOD = 33_333_333
 

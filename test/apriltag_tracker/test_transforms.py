@@ -8,7 +8,7 @@ from builtin_interfaces.msg import Time
 from scipy.spatial.transform import Rotation
 
 from apriltag_tracker.camera import CameraPose
-from apriltag_tracker.reports import camera_transform, limb_transforms, transform_publisher
+from apriltag_tracker.state_messages import camera_transform, limb_transforms, transforms_type
 
 STAMP = Time(sec=3, nanosec=5)
 
@@ -43,16 +43,11 @@ def test_points_of_the_base_are_seen_where_the_camera_sees_them():
     assert camera_transform(np.eye(3), np.zeros(3), STAMP).child_frame_id == "limb_camera"
 
 
-def test_transforms_are_published_where_tf2_is_installed(monkeypatch):
-    sent = []
-    publisher = SimpleNamespace(publish=sent.append)
-    node = SimpleNamespace(create_publisher=lambda _, topic, __: sent.append(topic) or publisher)
+def test_transforms_are_told_where_tf2_is_installed(monkeypatch):
     # A module that is None in sys.modules cannot be imported.
     monkeypatch.setitem(sys.modules, "tf2_msgs.msg", None)
-    assert transform_publisher(node) is None
+    assert transforms_type() is None
     message = SimpleNamespace(TFMessage=SimpleNamespace)
     monkeypatch.setitem(sys.modules, "tf2_msgs", message)
     monkeypatch.setitem(sys.modules, "tf2_msgs.msg", message)
-    transforms = limb_transforms(np.array([[0.0, 0.0], [0.2, 0.1]]), STAMP)
-    transform_publisher(node)(transforms)
-    assert sent == ["/tf", SimpleNamespace(transforms=transforms)]
+    assert transforms_type() is SimpleNamespace

@@ -1,7 +1,9 @@
 """The driver and the emulated board as running nodes: runs, callers, refusals, how they end."""
 
+import contextlib
 import os
 import signal
+import socket
 import subprocess
 import time
 import uuid
@@ -128,6 +130,57 @@ def test_a_node_that_hangs_in_a_publication_delays_no_setpoint_that_has_arrived(
         assert PressureState.FAULT not in modes
         process.send_signal(signal.SIGINT)
         assert process.wait(60.0) == 0
+
+
+def test_a_lab_s_own_driver_is_played_and_vented_when_this_one_dies(graph):
+    """It hears and tells kPa in an order of its own, and is a board to the driver."""
+    client, told, states = graph.client, [], []
+    measured = np.zeros(4)
+    generator = np.random.default_rng(0)
+    publisher = client.node.create_publisher(Float64MultiArray, "/valves/measured", 10)
+
+    def regulate():
+        nonlocal measured
+        measured = measured + 0.3 * (np.array(told[-1] if told else [0.0] * 4) - measured)
+        trembling = measured + generator.normal(0.0, 0.002, 4)
+        publisher.publish(Float64MultiArray(data=trembling.tolist()))
+
+    client.subscribe(
+        Float64MultiArray, "/valves/command", 10, lambda message: told.append(message.data)
+    )
+    client.subscribe(PressureState, topics.PRESSURE_STATE, qos.STATES, states.append)
+    client.node.create_timer(0.05, regulate)
+    setpoints = client.node.create_publisher(
+        PressureSetpoint, topics.PRESSURE_SETPOINT, qos.SETPOINTS
+    )
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = f"tcp://127.0.0.1:{free.getsockname()[1]}"
+    lab = {"scale": 0.001, "order": "2,3,0,1"}
+    board = graph.start("pressure_driver", "topic_board", listen=port, **lab)
+    client.wait_ready(["topic_board"])
+    driver = graph.start(
+        "pressure_driver", "pressure_driver", port=port, protocol="native", supply_required=False
+    )
+    client.watch([board, driver])
+    client.wait_ready(["pressure_driver"])
+
+    def armed():
+        with contextlib.suppress(Exception):
+            return client.call("pressure_driver/arm", 20.0)
+
+    client.wait_for(armed, 60.0, "the driver to arm")
+
+    def filled():
+        setpoints.publish(PressureSetpoint(differential_pressure=[3000.0, -2000.0]))
+        client.spin(0.05)
+        return measured == pytest.approx([0.0, 2.0, 3.0, 0.0], abs=0.2)
+
+    client.wait_for(filled, 60.0, "the pressures, in the lab's order and unit")
+    assert states[-1].mode == PressureState.TRACKING
+    os.kill(driver.pid, signal.SIGKILL)
+    client.watch([board])
+    client.wait_for(lambda: max(measured) < 0.1, 60.0, "the vented chambers")
+    assert board.stop() == 0
 
 
 # ------------------------------------------------------------------------------- how nodes end

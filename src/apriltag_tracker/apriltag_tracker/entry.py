@@ -13,3 +13,13 @@ def apriltag_tracker() -> int:
 def synthetic_camera() -> int:
     """Run the synthetic camera."""
     return int(run_module("apriltag_tracker.synthetic.node"))
+
+
+def pose_tracker() -> int:
+    """Run the tracker of bodies."""
+    return int(run_module("apriltag_tracker.bodies.node"))
+
+
+def synthetic_poses() -> int:
+    """Run the simulated motion capture."""
+    return int(run_module("apriltag_tracker.synthetic.mocap.node"))

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import array
-import math
 import sys
 import time
-from pathlib import Path
+from dataclasses import replace
 
 import cv2
 import numpy as np
-from ament_index_python.packages import get_package_share_directory
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Point, Pose2D
+from geometry_msgs.msg import Pose2D
 from numpy.typing import NDArray
-from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, Image
-from visualization_msgs.msg import Marker, MarkerArray
 
 from apriltag_tracker.camera import CameraError, Intrinsics
 from apriltag_tracker.camera.images import Grabbed, ImageReader, Source, SourceError, open_source
@@ -26,47 +22,35 @@ from apriltag_tracker.pipeline import (
     LimbTracker,
     PlacedTag,
     TrackerOptions,
-    Uncertainty,
     warm_up,
 )
-from apriltag_tracker.pose.shape import CURVE_POINTS
-from apriltag_tracker.reports import (
-    NO_CALIBRATION,
-    ImageWatch,
-    StampGaps,
-    camera_transform,
-    draw_observation,
-    limb_transforms,
-    transform_publisher,
-)
+from apriltag_tracker.pose.node import LimbStateNode
+from apriltag_tracker.reports import NO_CALIBRATION, ImageWatch, draw_observation
+from apriltag_tracker.state_messages import camera_transform
 from apriltag_tracker.tag_map import TagMap
-from der_msgs.msg import LimbState, TagDetection, TagDetectionArray
+from apriltag_tracker.watching import StampGaps
+from der_msgs.msg import TagDetection
 from limb_interfaces import qos, stamps, topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
 from limb_interfaces.parameters import check_overrides, declare
 from limb_interfaces.runner import run_node
 
 ANNOTATED_IMAGE = "camera/image_annotated"
-_MARKER_PERIOD = 0.1
 
 
-class TrackerNode(Node):
+class TrackerNode(LimbStateNode):
     """Follows the limb in images of a topic, a camera, a video file or a folder."""
 
     def __init__(self) -> None:
-        super().__init__("apriltag_tracker", namespace=topics.NAMESPACE)
-        share = Path(get_package_share_directory("apriltag_tracker")) / "config"
-        tag_map = declare(
-            self, "tag_map", str(share / "tags.yaml"), "YAML file: where the tags are"
-        )
+        super().__init__("apriltag_tracker", "tag_map", "tags.yaml", "tag")
         calibration = declare(
             self, "calibration_file", "", "camera_info YAML; empty: from the camera_info topic"
         )
         where = "where images come from: topic, /dev/videoN, a video file, or a folder of images"
         source = str(declare(self, "source", "topic", where))
-        rate = self._number("source_rate", 30.0, "images a second from a folder", 0.1, 500.0)
-        cv2.setNumThreads(int(self._number("threads", 1, "threads of OpenCV", 1, 64)))
-        self._map = TagMap.from_yaml(str(tag_map))
+        rate = self.number("source_rate", 30.0, "images a second from a folder", 0.1, 500.0)
+        cv2.setNumThreads(int(self.number("threads", 1, "threads of OpenCV", 1, 64)))
+        self._map = TagMap.from_yaml(self.map_path)
         self._options = self._declare_options()
         self._detector = self._make_detector()
         check_overrides(self)
@@ -74,13 +58,10 @@ class TrackerNode(Node):
         warm_up(self._detector)
         self._gaps = StampGaps()
         self._tracker: LimbTracker | None = None
-        self._curve: list[Point] = []
-        """Points of the message, which are written anew for every state."""
         self._reader = ImageReader()
         self._last_stamp = -1
         self._frame = ""
         self._level = ""
-        self._last_markers = 0.0
         self._image_topic = self.resolve_topic_name(topics.IMAGE)
         self._watch = ImageWatch(
             self._image_topic if source == "topic" else source, is_topic=source == "topic"
@@ -113,57 +94,29 @@ class TrackerNode(Node):
         lens = self._tracker.intrinsics
         return open_source(source, rate, size=(lens.width, lens.height))
 
-    def _number(
-        self, name: str, default: float, description: str, at_least: float, at_most: float
-    ) -> float:
-        """Declare a number; one whose default is whole is whole."""
-        return declare(self, name, default, description, at_least=at_least, at_most=at_most)
-
     def _declare_options(self) -> TrackerOptions:
-        usual = TrackerOptions()
-        sigma = usual.uncertainty
-        of_heights, of_places = "of limb tags' heights, m", "of limb tags on the limb, m"
-        missing = "frames without limb tags that are bridged and marked"
-        apart = "distance in m from the other tags' shape at which a tag is left out"
-        unsure = "standard deviation of the tip in m above which no tip is told"
+        options = self.declare_following(TrackerOptions())
+        heights = "of limb tags' heights, m"
+        height = self.number("height_sigma", options.uncertainty.height, heights, 0.0, 0.1)
         period = "s between searches of the whole image; 0 searches every image in full"
-        number = self._number
-        return TrackerOptions(
-            bridge_frames=int(number("bridge_frames", usual.bridge_frames, missing, 0, 30)),
-            reject_beyond=number("reject_beyond", usual.reject_beyond, apart, 0.0, 0.1),
-            largest_tip_sigma=number(
-                "largest_tip_sigma", usual.largest_tip_sigma, unsure, 0.0, 1.0
-            ),
-            uncertainty=Uncertainty(
-                survey=number("survey_sigma", sigma.survey, "of fixed tags' places, m", 0.0, 0.1),
-                height=number("height_sigma", sigma.height, of_heights, 0.0, 0.1),
-                mounting=number("mounting_sigma", sigma.mounting, of_places, 0.0, 0.1),
-                mounting_angle=number(
-                    "mounting_angle_sigma",
-                    sigma.mounting_angle,
-                    "of limb tags' directions, rad",
-                    0.0,
-                    1.0,
-                ),
-            ),
-            full_search_period=number(
-                "full_search_period", usual.full_search_period, period, 0.0, 60.0
+        return replace(
+            options,
+            uncertainty=replace(options.uncertainty, height=height),
+            full_search_period=self.number(
+                "full_search_period", options.full_search_period, period, 0.0, 60.0
             ),
         )
 
     def _make_detector(self) -> Detector:
         family = self._map.family
-        shortest = self._number("smallest_tag", 14.0, "shortest side of a tag in px", 8.0, 500.0)
+        shortest = self.number("smallest_tag", 14.0, "shortest side of a tag in px", 8.0, 500.0)
         forgiven = "wrong bits of a code that are forgiven in a search"
-        bits = self._number("correct_bits", family.correct_bits, forgiven, 0, family.most_corrected)
+        bits = self.number("correct_bits", family.correct_bits, forgiven, 0, family.most_corrected)
         return Detector(shortest, int(bits), family=family)
 
     def _make_topics(self) -> None:
-        self._tags = self.create_publisher(TagDetectionArray, topics.TAGS, qos.STATES)
-        self._states = self.create_publisher(LimbState, topics.LIMB_STATE, qos.STATES)
-        self._markers = self.create_publisher(MarkerArray, topics.SHAPE_MARKERS, qos.STATES)
+        self.make_outputs(len(self._map.segment_lengths))
         self._annotated = self.create_publisher(Image, ANNOTATED_IMAGE, qos.SENSOR_DATA)
-        self._publish_on_tf = transform_publisher(self)
 
     def _subscribe(self, needs_info: bool) -> None:
         # A best-effort subscriber hears best-effort and reliable publishers alike.
@@ -198,7 +151,6 @@ class TrackerNode(Node):
         ):
             return
         self._tracker = LimbTracker(self._map, intrinsics, self._options, self._detector)
-        self._curve = [Point() for _ in range(CURVE_POINTS)]
 
     def _on_image(self, message: Image) -> None:
         self._frame = message.header.frame_id
@@ -236,6 +188,7 @@ class TrackerNode(Node):
             self._watch.repeated += 1
             return
         self._last_stamp = stamps.nanoseconds(stamp)
+        stamp = stamps.stamp_from_nanoseconds(self._last_stamp - self.sensor_delay)
         self._gaps.take(self._last_stamp)
         if self._tracker is None:
             self._fail(stamp, self._watch.calibration_problem or NO_CALIBRATION)
@@ -252,28 +205,22 @@ class TrackerNode(Node):
     def _fail(self, stamp: Time, problem: str) -> None:
         """Say at once that this image gives no state, and why."""
         self._watch.failed_with(problem)
-        self._states.publish(self._state(LimbObservation((), None, problem), stamp))
+        self.publish_state(None, problem, stamp)
 
     # Output
 
     def _publish(self, observation: LimbObservation, gray: NDArray[np.uint8], stamp: Time) -> float:
         """Publish everything; returns the latency of the state [s]."""
-        state = self._state(observation, stamp)
-        self._states.publish(state)
-        tags = TagDetectionArray(detections=[_tag_message(placed) for placed in observation.tags])
-        tags.header.stamp = stamp
-        tags.header.frame_id = topics.BASE_FRAME
-        self._tags.publish(tags)
-        self._publish_transforms(observation, stamp)
-        now = time.monotonic()
-        if (
-            now - self._last_markers >= _MARKER_PERIOD
-            and self._markers.get_subscription_count() > 0
-            and observation.estimate is not None
-        ):
-            self._last_markers = now
-            self._markers.publish(_limb_markers(state))
-        if self._annotated.get_subscription_count() > 0 and self._tracker is not None:
+        assert self._tracker is not None
+        pose = self._tracker.world.pose
+        camera = (
+            []
+            if pose is None
+            else [camera_transform(pose.rotation, pose.translation, stamp, self._frame)]
+        )
+        latency = self.publish_state(observation.estimate, observation.reason, stamp, camera)
+        self.publish_tags([_tag_message(placed) for placed in observation.tags], stamp)
+        if self._annotated.get_subscription_count() > 0:
             picture = draw_observation(gray, observation, self._tracker)
             message = Image(
                 height=picture.shape[0],
@@ -284,50 +231,7 @@ class TrackerNode(Node):
             )
             message.header.stamp = stamp
             self._annotated.publish(message)
-        return float(state.latency)
-
-    def _publish_transforms(self, observation: LimbObservation, stamp: Time) -> None:
-        """Tell RViz where clamp, tip and camera are, where tf2 is installed."""
-        if self._publish_on_tf is None or self._tracker is None:
-            return
-        found = []
-        if observation.estimate is not None:
-            found += limb_transforms(observation.estimate.curve, stamp)
-        pose = self._tracker.world.pose
-        if pose is not None:
-            found.append(camera_transform(pose.rotation, pose.translation, stamp, self._frame))
-        if found:
-            self._publish_on_tf(found)
-
-    def _state(self, observation: LimbObservation, stamp: Time) -> LimbState:
-        message = LimbState(reason=observation.reason)
-        message.header.stamp = stamp
-        message.header.frame_id = topics.BASE_FRAME
-        count = len(self._map.segment_lengths)
-        estimate = observation.estimate
-        if estimate is None:
-            nan = math.nan
-            message.tip = Point(x=nan, y=nan, z=nan)
-            message.tip_covariance = message.tip_systematic = [nan] * 4
-            message.bend_angle = message.bend_angle_sigma = message.curvature = [nan] * count
-            message.elongation = message.residual = nan
-        else:
-            message.valid = True
-            message.tip = Point(x=float(estimate.tip[0]), y=float(estimate.tip[1]), z=0.0)
-            message.tip_covariance = estimate.tip_covariance.ravel()
-            message.tip_systematic = estimate.tip_systematic.ravel()
-            message.bend_angle = estimate.bend_angle.tolist()
-            message.bend_angle_sigma = estimate.bend_angle_sigma.tolist()
-            message.curvature = estimate.curvature.tolist()
-            message.elongation = estimate.elongation
-            message.residual = estimate.residual
-            for point, (x, y) in zip(self._curve, estimate.curve.tolist(), strict=True):
-                point.x, point.y = x, y
-            message.curve = self._curve
-            message.tags_used = len(estimate.tags_used)
-        now = self.get_clock().now().nanoseconds
-        message.latency = (now - stamps.nanoseconds(stamp)) / stamps.NANOSECONDS
-        return message
+        return latency
 
     def _health(self) -> Health:
         publishers = self.count_publishers(self._image_topic) if self._source is None else 0
@@ -358,21 +262,6 @@ def _tag_message(placed: PlacedTag) -> TagDetection:
         x, y, yaw = placed.pose.tolist()
         message.pose = Pose2D(x=x, y=y, theta=yaw)
     return message
-
-
-def _limb_markers(state: LimbState) -> MarkerArray:
-    """Draw the measured limb and its tip for RViz and Foxglove."""
-    line = Marker(ns="measured", id=0, type=Marker.LINE_STRIP, points=list(state.curve))
-    tip = Marker(ns="measured", id=1, type=Marker.SPHERE)
-    for marker in (line, tip):
-        marker.header = state.header
-        marker.color.g = marker.color.b = 0.7
-        marker.color.a = 1.0
-        marker.pose.orientation.w = 1.0
-    line.scale.x = 0.004
-    tip.pose.position = state.tip
-    tip.scale.x = tip.scale.y = tip.scale.z = 0.01
-    return MarkerArray(markers=[line, tip])
 
 
 def main() -> int:

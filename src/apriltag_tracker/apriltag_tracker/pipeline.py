@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,52 +12,25 @@ from numpy.typing import NDArray
 from apriltag_tracker.camera import CameraPose, Intrinsics
 from apriltag_tracker.detection import Detector, Tag
 from apriltag_tracker.detection.tracking import FULL_SEARCH_PERIOD, TagTracker
-from apriltag_tracker.pose.plane import centreline_pose, locate, pose_moves
-from apriltag_tracker.pose.shape import LimbEstimate, PlanarTag, ShapeFitter, ShapePrior
+from apriltag_tracker.pose.following import FollowerOptions, LimbFollower
+from apriltag_tracker.pose.plane import locate, pose_moves
+from apriltag_tracker.pose.shape import LimbEstimate, PlanarTag, centreline_pose
 from apriltag_tracker.pose.world import WorldPose
 from apriltag_tracker.tag_map import LimbTag, TagMap, WorldTag
 
 
 @dataclass(frozen=True)
-class Uncertainty:
-    """Standard deviations of what averaging does not remove.
-
-    Attributes:
-        survey: of the fixed tags' positions [m].
-        height: of the limb tags' heights [m].
-        mounting: of the limb tags' positions on the limb [m].
-        mounting_angle: of their directions [rad].
-    """
-
-    survey: float = 3e-4
-    height: float = 5e-4
-    mounting: float = 2e-4
-    mounting_angle: float = 5e-3
-
-
-@dataclass(frozen=True)
-class TrackerOptions:
+class TrackerOptions(FollowerOptions):
     """How the tracker works.
 
     Attributes:
-        bridge_frames: frames without a tip that are bridged from the motion before.
-        reject_beyond: distance from the other tags' shape at which a tag is on the wrong place [m].
         largest_misfit: RMS distance of a tag's corners from a square of its size [m, as a share of
             the size] above which it is not at the height it should be at.
-        uncertainty: what averaging does not remove.
-        largest_tip_sigma: standard deviation of the tip, noise and systematic together, above which
-            it is not told [m].
-        prior: how the limb may differ from ideal.
         full_search_period: s between searches of the whole image while all tags are tracked; 0
             searches every image in full.
     """
 
-    bridge_frames: int = 5
-    reject_beyond: float = 0.004
     largest_misfit: float = 0.06
-    largest_tip_sigma: float = 0.01
-    uncertainty: Uncertainty = field(default_factory=Uncertainty)
-    prior: ShapePrior = field(default_factory=ShapePrior)
     full_search_period: float = FULL_SEARCH_PERIOD
 
 
@@ -120,18 +93,8 @@ class LimbTracker:
             )
         self.tracker = TagTracker(self._flat, detector, self.options.full_search_period)
         self.world = WorldPose(tags, intrinsics)
-        uncertainty = self.options.uncertainty
-        self.fitter = ShapeFitter(
-            tags,
-            self.options.prior,
-            self.options.reject_beyond,
-            uncertainty.mounting,
-            uncertainty.mounting_angle,
-        )
-        self._history: list[tuple[float, LimbEstimate]] = []
-        self._bridged = 0
-        self.misplaced = 0
-        """Tags left out so far because they were on the wrong place."""
+        names = {tag.id: str(tag.id) for tag in tags.limb}
+        self.follower = LimbFollower(tags, names, self.options)
 
     def observe(
         self, gray: NDArray[np.uint8], stamp: float, search_later: bool = False
@@ -157,20 +120,8 @@ class LimbTracker:
         placed, planar, common, shared_noise = self._place(found, pose)
         if pose is None:
             return LimbObservation(placed, None, f"no camera pose: {self.world.problem}")
-        estimate = self.fitter.fit(planar, common, shared_noise) if planar else None
-        if estimate is None:
-            return self._bridge(placed, stamp, bool(planar))
-        self.misplaced += len(estimate.rejected)
-        sigma = estimate.tip_sigma
-        if sigma > self.options.largest_tip_sigma:
-            self._history.clear()
-            reason = f"the tip is known to {1e3 * sigma:.0f} mm only; {self._remark(estimate)}"
-            return LimbObservation(placed, None, reason)
-        self._bridged = 0
-        if self._history and stamp <= self._history[-1][0]:
-            self._history.clear()
-        self._history = [*self._history[-1:], (stamp, estimate)]
-        return LimbObservation(placed, estimate, self._remark(estimate))
+        followed = self.follower.follow(planar, stamp, common, shared_noise)
+        return LimbObservation(placed, *followed)
 
     def search_again(self, gray: NDArray[np.uint8]) -> None:
         """Look for duplicates and unknown tags in the last image, if that was left for later."""
@@ -200,7 +151,7 @@ class LimbTracker:
         planar = []
         for i in used:
             entry = self._limb_tags[found[i].id]
-            centre = centreline_pose(places[i], entry)
+            centre = centreline_pose(places[i], entry.offset)
             planar.append(PlanarTag(entry.id, entry.arc_length, centre, spreads[i]))
         common = self._common_errors(places[used], flat[used, 0], pose)
         everywhere = tuple(
@@ -233,59 +184,6 @@ class LimbTracker:
         outward = (places[:, :2] - origin[:2]) / (heights - origin[2])[:, None]
         moves[:, :2, 3] = uncertainty.height * outward
         return moves
-
-    def _remark(self, estimate: LimbEstimate) -> str:
-        parts = []
-        if estimate.rejected:
-            wrong = ", ".join(
-                f"{tag} ({1e3 * distance:.0f} mm off)"
-                for tag, distance in estimate.rejected.items()
-            )
-            parts.append(f"tag on the wrong place, left out: {wrong}")
-        unseen = [
-            str(tag.id)
-            for tag in self.tags.limb
-            if tag.id not in estimate.tags_used and tag.id not in estimate.rejected
-        ]
-        if unseen:
-            parts.append(f"without tag {', '.join(unseen)}")
-        return "; ".join(parts)
-
-    def _bridge(
-        self, placed: tuple[PlacedTag, ...], stamp: float, inconsistent: bool
-    ) -> LimbObservation:
-        """Continue the last motion for a few frames, with a covariance that grows."""
-        cause = (
-            "the limb's tags contradict each other" if inconsistent else "no limb tag in the image"
-        )
-        self._bridged += 1
-        if self._bridged > self.options.bridge_frames or len(self._history) < 2:
-            self._history.clear()
-            self.fitter.reset()
-            return LimbObservation(placed, None, cause)
-        (before, old), (last, new) = self._history
-        share = (stamp - last) / (last - before)
-        # How wrong the continuation can be: as far as the limb went meanwhile, and a millimetre.
-        slip = (new.tip - old.tip) * share
-        growth = np.outer(slip, slip) + 1e-6 * np.eye(2)
-        estimate = LimbEstimate(
-            tip=new.tip + slip,
-            tip_covariance=new.tip_covariance + growth,
-            tip_systematic=new.tip_systematic,
-            tip_heading=new.tip_heading + (new.tip_heading - old.tip_heading) * share,
-            bend_angle=new.bend_angle + (new.bend_angle - old.bend_angle) * share,
-            bend_angle_sigma=new.bend_angle_sigma
-            + np.abs(new.bend_angle - old.bend_angle) * share
-            + 0.01,
-            curvature=new.curvature + (new.curvature - old.curvature) * share,
-            elongation=new.elongation,
-            residual=new.residual,
-            curve=new.curve + (new.curve - old.curve) * share,
-            tags_used=(),
-        )
-        frames = "frame" if self._bridged == 1 else "frames"
-        remark = f"bridged {self._bridged} {frames}: {cause}"
-        return LimbObservation(placed, estimate, remark, bridged=True)
 
 
 def warm_up(detector: Detector) -> None:

@@ -136,34 +136,44 @@ class TagMap:
             family = families.named(data.get("family"))
         except ValueError as error:
             raise TagMapError(str(error)) from error
-        limb = _section(data, "limb")
-        world = _section(data, "world")
-        lengths = tuple(_floats(limb.get("segment_lengths"), None, "limb.segment_lengths"))
-        if not lengths or min(lengths) <= 0.0:
-            raise TagMapError("limb.segment_lengths: a list of positive lengths in m expected")
+        limb = section(data, "limb")
+        world = section(data, "world")
+        lengths, stiff = limb_geometry(limb)
         total = sum(lengths)
         limb_tags = tuple(_limb_tag(entry, total, family) for entry in limb.get("tags") or [])
         if not limb_tags:
             raise TagMapError("limb.tags is empty: at least one tag must be on the limb")
         world_tags = tuple(_world_tag(entry, family) for entry in world.get("tags") or [])
-        stiff = _stiff(limb.get("stiff") or [], lengths)
         return cls(lengths, limb_tags, world_tags, stiff, family)
 
 
-def _section(data: dict[str, Any], name: str) -> dict[str, Any]:
-    section = data.get(name)
-    if not isinstance(section, dict):
+def limb_geometry(
+    limb: dict[str, Any],
+) -> tuple[tuple[float, ...], tuple[tuple[float, float], ...]]:
+    """Read the segments' lengths and the stiff stretches [m] of a map; raises `TagMapError`."""
+    lengths = tuple(floats(limb.get("segment_lengths"), None, "limb.segment_lengths"))
+    if not lengths or min(lengths) <= 0.0:
+        raise TagMapError("limb.segment_lengths: a list of positive lengths in m expected")
+    return lengths, _stiff(limb.get("stiff") or [], lengths)
+
+
+def section(data: dict[str, Any], name: str) -> dict[str, Any]:
+    """Return a part of a map that must be there; raises `TagMapError`."""
+    found = data.get(name)
+    if not isinstance(found, dict):
         raise TagMapError(f"section '{name}' is missing")
-    return section
+    return found
 
 
-def _floats(value: Any, count: int | None, name: str) -> list[float]:
+def floats(value: Any, count: int | None, name: str) -> list[float]:
+    """Return a list of ``count`` finite numbers, of any count if None; raises `TagMapError`."""
     if not isinstance(value, list) or (count is not None and len(value) != count):
         raise TagMapError(f"{name}: a list of {count or 'some'} numbers expected, not {value!r}")
-    return [_number(entry, name) for entry in value]
+    return [number(entry, name) for entry in value]
 
 
-def _number(value: Any, name: str) -> float:
+def number(value: Any, name: str) -> float:
+    """Return a finite number; raises `TagMapError`."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise TagMapError(f"{name}: a finite number expected, not {value!r}")
     return float(value)
@@ -172,7 +182,7 @@ def _number(value: Any, name: str) -> float:
 def _stiff(value: Any, lengths: tuple[float, ...]) -> tuple[tuple[float, float], ...]:
     result: list[tuple[float, float]] = []
     for entry in value if isinstance(value, list) else [value]:
-        start, end = _floats(entry, 2, "limb.stiff")
+        start, end = floats(entry, 2, "limb.stiff")
         if not (result[-1][1] if result else 0.0) <= start < end <= sum(lengths) + 1e-9:
             raise TagMapError(f"limb.stiff: {entry} is out of order or not on the limb")
         result.append((start, end))
@@ -197,7 +207,7 @@ def _common(entry: Any, where: str, family: Family) -> tuple[int, float, str]:
             f"{family.name} has"
         )
     name = f"{where} {tag}"
-    size = _number(entry.get("size"), f"{name}: size")
+    size = number(entry.get("size"), f"{name}: size")
     if size <= 0.0:
         raise TagMapError(f"{name}: size {size} m must be positive")
     return tag, size, name
@@ -205,16 +215,16 @@ def _common(entry: Any, where: str, family: Family) -> tuple[int, float, str]:
 
 def _limb_tag(entry: Any, total: float, family: Family) -> LimbTag:
     tag, size, name = _common(entry, "limb tag", family)
-    arc_length = _number(entry.get("arc_length"), f"{name}: arc_length")
+    arc_length = number(entry.get("arc_length"), f"{name}: arc_length")
     if not 0.0 <= arc_length <= total:
         raise TagMapError(f"{name}: arc_length {arc_length} m is not on the limb (0 to {total} m)")
-    offset = _floats(entry.get("offset", [0.0, 0.0, 0.0]), 3, f"{name}: offset")
-    height = _number(entry.get("height"), f"{name}: height")
+    offset = floats(entry.get("offset", [0.0, 0.0, 0.0]), 3, f"{name}: offset")
+    height = number(entry.get("height"), f"{name}: height")
     return LimbTag(tag, arc_length, height, size, (offset[0], offset[1], offset[2]))
 
 
 def _world_tag(entry: Any, family: Family) -> WorldTag:
     tag, size, name = _common(entry, "world tag", family)
-    position = _floats(entry.get("position"), 3, f"{name}: position")
-    yaw = _number(entry.get("yaw", 0.0), f"{name}: yaw")
+    position = floats(entry.get("position"), 3, f"{name}: position")
+    yaw = number(entry.get("yaw", 0.0), f"{name}: yaw")
     return WorldTag(tag, (position[0], position[1], position[2]), yaw, size)

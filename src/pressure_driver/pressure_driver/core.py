@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 from pressure_driver.following import chamber_gauge
+from pressure_driver.hoses import Hoses
 from pressure_driver.protocols import (
     STANDARD_ATMOSPHERE,
     BoardFailure,
@@ -146,6 +147,7 @@ class DriverCore:
         self.machine = SafetyMachine(settings, self.monitor, self._conditions)
         self.board = BoardWatch(protocol, settings)
         self._settings = settings
+        self._hoses = Hoses(settings.wiring, settings.segment_count) if settings.wiring else None
         self._log = log
         self._link_fault = "the serial port is not open"
         self._texts: deque[str] = deque()
@@ -264,8 +266,11 @@ class DriverCore:
         if self.venting:
             self.machine.command_nothing()
             return self.board.greeting(now) + self._vent_bytes()
+        asked = self.machine.differential
         data, self._pending_number = self.protocol.setpoint(
-            self.machine.differential, self._wire_atmosphere(), self._settings.command_validity
+            asked if self._hoses is None else self._hoses.to_board(asked),
+            self._wire_atmosphere(),
+            self._settings.command_validity,
         )
         return data
 
@@ -319,6 +324,8 @@ class DriverCore:
 
     def _serve(self, event: Event, now: float) -> None:
         if isinstance(event, Telemetry):
+            if self._hoses is not None:
+                event = self._hoses.from_board(event)
             # Rest pressures are measured only where nothing has been asked of the chambers.
             self.monitor.receive(event, now, self.machine.mode in (Mode.DISARMED, Mode.FAULT))
         elif isinstance(event, Echo):

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from dataclasses import MISSING, Field, dataclass, field, fields
 from typing import Any, NamedTuple, TypeVar
 
+from pressure_driver.hoses import HoseError, Hoses
 from pressure_driver.protocols import NAMES
 
 TERMINALS = ("vtem", "mpa")
@@ -78,6 +79,11 @@ class Settings:
         0.25, "s", 0.06, 10.0, "a `native` board vents by itself after this time without a command"
     )
     segment_count: int = _number(2, "", 1, 16, "pairs of chambers")
+    wiring: str = _other(
+        "",
+        "valve of the board that feeds each chamber of the limb, as 3,4,1,2; empty: each its own "
+        "(scripts/check_rig.py finds it)",
+    )
     pressure_limit: float = _number(24_000.0, "Pa", 0.0, 1e5, "largest differential pressure")
     slew_limit: float = _number(
         200_000.0, "Pa/s", 1.0, 1e7, "of setpoints and of what is commanded: 10 kPa a tick"
@@ -151,6 +157,11 @@ class Settings:
                     f"parameters '{low}' ({below:g} Pa) and '{high}' ({above:g} Pa): the first "
                     f"must be smaller{reason}"
                 )
+        if self.wiring:
+            try:
+                Hoses(self.wiring, self.segment_count)
+            except HoseError as error:
+                raise SettingError(f"parameter 'wiring': {error}") from error
         if self.command_validity * self.rate <= 1.0:
             raise SettingError(
                 f"parameters 'command_validity' ({self.command_validity:g} s) and 'rate' "

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from apriltag_tracker.camera import CameraPose, project
-from apriltag_tracker.pose.plane import centreline_pose, locate, planar_poses
+from apriltag_tracker.pose.plane import locate, planar_poses
+from apriltag_tracker.pose.shape import centreline_pose
 from apriltag_tracker.tag_map import UNIT_CORNERS, LimbTag
 
 
@@ -59,5 +60,5 @@ def test_tags_are_placed_at_their_height(model):
 
 def test_the_mounting_offset_is_taken_off():
     tag = LimbTag(0, 0.1, 0.03, 0.016, (0.002, -0.001, 0.1))
-    place = centreline_pose(np.array([1.0, 2.0, np.pi / 2 + 0.1]), tag)
+    place = centreline_pose(np.array([1.0, 2.0, np.pi / 2 + 0.1]), tag.offset)
     assert np.allclose(place, (1.0 - 0.001, 2.0 - 0.002, np.pi / 2))

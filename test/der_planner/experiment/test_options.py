@@ -24,6 +24,7 @@ from der_planner.limb import Limb, PointMass
         (["--page", "70000"], "--page is 70000"),
         (["--page", "--offline"], "does not go with --offline"),
         (["--library", "/nowhere"], "/nowhere is no folder"),
+        (["--poses", "--offline"], "--poses is motion capture of the twin"),
         (["--board", "arduino"], "unknown board 'arduino'"),
         (["--board", "festo", "--offline"], "--offline has no board"),
     ],

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
 from apriltag_tracker.camera import CameraPose, Intrinsics
-from apriltag_tracker.tag_map import UNIT_CORNERS, LimbTag
+from apriltag_tracker.tag_map import UNIT_CORNERS
 
 
 def planar_poses(
@@ -111,17 +109,3 @@ def pose_moves(
     turn = np.einsum("nr,nrk->nk", over[:, :2], right - middle)
     turn -= np.einsum("nr,nrk->nk", along[:, :2], up - middle)
     return np.concatenate([middle, 0.5 * (turn / half[:, None] ** 2)[:, None]], axis=1)
-
-
-def centreline_pose(place: NDArray[np.float64], tag: LimbTag) -> NDArray[np.float64]:
-    """Take the mounting offset off a tag's pose: the centreline's pose at its arc length, (3,)."""
-    along, across, turn = tag.offset
-    heading = place[2] - turn
-    cosine, sine = math.cos(heading), math.sin(heading)
-    return np.array(
-        [
-            place[0] - cosine * along + sine * across,
-            place[1] - sine * along - cosine * across,
-            heading,
-        ]
-    )

@@ -10,12 +10,28 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apriltag_tracker.pose.curve import PLACE, Curve, CurveFit, Evaluation, fit_curve
-from apriltag_tracker.tag_map import TagMap
+
+
+class LimbGeometry(Protocol):
+    """What the fit knows of the limb: a map of tags or of bodies says it."""
+
+    @property
+    def segment_lengths(self) -> tuple[float, ...]:
+        """Of the limb at rest [m]."""
+
+    @property
+    def stiff(self) -> tuple[tuple[float, float], ...]:
+        """Stretches that cannot bend, from and to in arc length [m]."""
+
+    @property
+    def length(self) -> float:
+        """Arc length of the tip at rest [m]."""
 
 
 @dataclass(frozen=True)
@@ -103,6 +119,27 @@ class LimbEstimate:
         return float(np.sqrt(np.linalg.eigvalsh(both)[-1]))
 
 
+def centreline_pose(
+    place: NDArray[np.float64], offset: tuple[float, float, float]
+) -> NDArray[np.float64]:
+    """Take a mounting offset off a pose in the plane: the centreline's pose where it sits, (3,).
+
+    Args:
+        place: (3,) x, y [m], heading [rad] of a tag or body.
+        offset: of it along and across the limb [m] and of its direction [rad].
+    """
+    along, across, turn = offset
+    heading = place[2] - turn
+    cosine, sine = np.cos(heading), np.sin(heading)
+    return np.array(
+        [
+            place[0] - cosine * along + sine * across,
+            place[1] - sine * along - cosine * across,
+            heading,
+        ]
+    )
+
+
 def _carried(gain: NDArray[np.float64], spreads: NDArray[np.float64]) -> NDArray[np.float64]:
     """Carry independent covariances (n, 3, 3), or one for all (3, 3), through a gain (m, n, 3)."""
     by_tag = gain.transpose(1, 0, 2)
@@ -125,7 +162,7 @@ class ShapeFitter:
     """Fits the limb to its tags.
 
     Args:
-        tags: the tag map; gives lengths and which tags there are.
+        geometry: of the limb.
         prior: how the limb may differ from ideal.
         reject_beyond: distance from the fit of all others at which a tag is on the wrong place [m].
         mounting: standard deviation of the tags' mounting on the limb [m].
@@ -134,7 +171,7 @@ class ShapeFitter:
 
     def __init__(
         self,
-        tags: TagMap,
+        geometry: LimbGeometry,
         prior: ShapePrior | None = None,
         reject_beyond: float = 0.004,
         mounting: float = 2e-4,
@@ -143,10 +180,10 @@ class ShapeFitter:
         self.prior = prior or ShapePrior()
         self.reject_beyond = reject_beyond
         self._mounting = np.array([mounting, mounting, mounting_angle])
-        self._smooth = Curve(tags.segment_lengths, len(self.prior.corrections), tags.stiff)
-        self._constant = Curve(tags.segment_lengths, 0, tags.stiff)
+        self._smooth = Curve(geometry.segment_lengths, len(self.prior.corrections), geometry.stiff)
+        self._constant = Curve(geometry.segment_lengths, 0, geometry.stiff)
         self._outline = Evaluation(
-            self._smooth, np.linspace(0.0, tags.length, CURVE_POINTS).tolist()
+            self._smooth, np.linspace(0.0, geometry.length, CURVE_POINTS).tolist()
         )
         self._evaluations: dict[tuple[int, tuple[float, ...]], Evaluation] = {}
         self._last = np.zeros(self._smooth.size)

@@ -5,6 +5,7 @@
     python3 scripts/calibrate_limb.py --graph --hardware my_rig.yaml --out my_limb.yaml
     python3 scripts/calibrate_limb.py --bag calibrations/DATE/bag --out my_limb.yaml
     python3 scripts/calibrate_limb.py --csv log.csv --columns map.yaml --mass 0.31 --out limb.yaml
+    python3 scripts/calibrate_limb.py their_log.csv --out limb.yaml
 
 --offline plays the calibration on the twin in one process, in seconds. --graph plays it in real
 time on the running graph, on the twin or the hardware, records a bag, vents, and fits to the bag:
@@ -59,7 +60,9 @@ from der_planner.identification.excitation import (
     within_limits,
     write_excitation,
 )
+from der_planner.identification.foreign import ask_map, is_bag, read_bag_table
 from der_planner.identification.log import prepare
+from der_planner.identification.readers import is_ours, read_table
 from der_planner.identification.report import plot_prediction
 from der_planner.limb import Limb, LimbError
 from der_planner.planning.loads import nearly_buckling
@@ -67,6 +70,8 @@ from pressure_driver.settings import Settings
 
 LIGHTEST = 1e-3
 """A limb of less [kg] is a mistake in the unit."""
+LAST_PART = 0.25
+"""Share of a LOG that is kept back to judge the fit."""
 SAME_MASS = 0.01
 """Share by which the fitted lengths may change the mass of a limb that was weighed."""
 
@@ -98,8 +103,13 @@ def _main(given: argparse.Namespace) -> int:
             file=sys.stderr,
         )
     log = _obtain(prior, given)
+    kept_back = []
+    if given.log is not None:
+        log, rest = log.parted(LAST_PART)
+        kept_back = [dataclasses.replace(rest, source=f"the end of {rest.source}, not shown")]
     limb, report = _fit(prior, log, loads, given)
     unseen = [read_log(path, given.columns, given.namespace) for path in given.held_out]
+    unseen = [*kept_back, *unseen]
     kept = loads.unloaded(limb)
     lines = [report.text(), *(_held_out_text(limb, each, given.longest_gap) for each in unseen)]
     text = "\n".join([*lines, _weight(kept, given)])
@@ -123,6 +133,13 @@ def _parser() -> argparse.ArgumentParser:
         "--graph", action="store_true", help="play on the running graph, record a bag and fit to it"
     )
     source.add_argument("--bag", type=Path, help="fit to a recorded run")
+    source.add_argument(
+        "log",
+        type=Path,
+        nargs="?",
+        metavar="LOG",
+        help="fit to a log of any program, a table or a bag; what cannot be known is asked once",
+    )
     source.add_argument("--csv", type=Path, help="fit to a table; needs --columns")
     source.add_argument(
         "--excitation", type=Path, metavar="FILE", help="write the run's pressures as CSV and stop"
@@ -261,11 +278,35 @@ def _obtain(prior: Limb, given: argparse.Namespace) -> CalibrationLog:
     if given.graph:
         return read_bag(_play_on_graph(prior, given))
     if not given.offline:
-        return read_log(given.bag or given.csv, given.columns, given.namespace)
+        return read_log(given.log or given.bag or given.csv, _columns(given), given.namespace)
     limit = prior.pneumatics.pressure_limit
     run = within_limits(_excitation(prior, limit, given), limit, math.inf)
     print(f"playing {run.duration:.0f} s on the twin of seed {given.seed} …", file=sys.stderr)
     return record_twin(given.seed, run, limb=prior)
+
+
+def _columns(given: argparse.Namespace) -> Path | None:
+    """Return the map of the log's columns; of a LOG without one, ask for it and keep it.
+
+    Raises:
+        LogError: the log cannot be read, or there is nobody to ask.
+    """
+    if given.columns is not None or given.log is None:
+        return Path(given.columns) if given.columns else None
+    path = Path(f"{given.log}.columns.yaml")
+    if path.exists():
+        return path
+    if is_bag(given.log) and is_ours(given.log):
+        return None
+    names = list(read_bag_table(given.log) if is_bag(given.log) else read_table(given.log))
+    if not sys.stdin.isatty():
+        raise LogError(
+            f"{given.log} needs {path}, a map of its columns {', '.join(names)}: run this in a "
+            "terminal, and it asks"
+        )
+    ask_map(names, path)
+    print(f"written: {path}")
+    return path
 
 
 def _play_on_graph(prior: Limb, given: argparse.Namespace) -> Path:

@@ -151,6 +151,7 @@ class Ledger:
             "payload_at": options.loads.payload_at or "",
             "calibrate": options.calibrate,
             "offline": options.offline,
+            "poses": "yes" if options.poses else "",
             "hardware": options.hardware.place if options.hardware else "",
             "board": options.board,
         }

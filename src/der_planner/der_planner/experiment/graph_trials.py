@@ -53,6 +53,7 @@ def play_on_graph(run: TrialRun, progress: Progress) -> dict[str, Any]:
         board=options.board,
         planner=_planner_parameters(run),
         record_images=options.record_images,
+        poses=options.poses,
     )
     drawn = options.path if run.learned is None else None
     asked = _path(drawn) if drawn is not None else _command(run)
@@ -181,6 +182,8 @@ def play_calibration(
     prior: Limb,
     seed: int = 0,
     hardware: Hardware | None = None,
+    wiring: tuple[int, ...] | None = None,
+    poses: bool = False,
 ) -> Path:
     """Play the pressures of a calibration; say when the driver did not take all of them.
 
@@ -191,6 +194,8 @@ def play_calibration(
         prior: whose gravity and masses the twin gets.
         seed: of the twin.
         hardware: in place of the twin.
+        wiring: of the twin, as of `GraphSetup`.
+        poses: of the twin, as of `GraphSetup`.
 
     Returns:
         The bag.
@@ -208,7 +213,15 @@ def play_calibration(
         "largest_pressure_Pa": float(np.abs(excitation.differential_pressure).max()),
         "prior": prior.name,
     }
-    setup = GraphSetup(folder / "bag", metadata, seed=seed, limb=prior, hardware=hardware)
+    setup = GraphSetup(
+        folder / "bag",
+        metadata,
+        seed=seed,
+        limb=prior,
+        hardware=hardware,
+        poses=poses,
+        wiring=wiring,
+    )
     # The driver refuses a plan that it has heard before an arming: each run has its own.
     plan_id = f"calibration-{uuid.uuid4().hex[:8]}"
     sent = 0

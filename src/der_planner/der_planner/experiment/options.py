@@ -159,6 +159,9 @@ class Options:
         const=DEFAULT_PAGE_PORT,
         metavar="PORT",
     )
+    poses: bool = _option(
+        False, "simulated motion capture of rigid bodies in place of the twin's camera and tags"
+    )
     record_images: bool = _option(False, "raw images into the bags, too")
     report: bool = _option(True, "skip the HTML report at the end", flag="--no-report")
     dry_run: bool = _option(False, "say what would be done, start nothing")
@@ -267,6 +270,11 @@ def parse(arguments: Sequence[str]) -> Options:
         (
             hardware is not None and given.offline,
             "--offline simulates everything: it does not go with --hardware",
+        ),
+        (
+            given.poses and (given.offline or hardware is not None),
+            "--poses is motion capture of the twin: it goes with neither --offline nor --hardware "
+            "(a hardware file has the key poses)",
         ),
         (
             hardware is not None and given.board != BOARDS[0],

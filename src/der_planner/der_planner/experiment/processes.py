@@ -25,19 +25,23 @@ from der_planner.limb import Limb
 STOP_ORDER = (
     "planner",
     "apriltag_tracker",
+    "pose_tracker",
     "synthetic_camera",
+    "synthetic_poses",
     "limb_twin",
     "recorder",
     "pressure_driver",
     "page",
     "board_emulator",
 )
-MOVABLE = {"driver": "pressure_driver", "tracker": "apriltag_tracker"}
+MOVABLE = {"driver": "pressure_driver", "tracker": "apriltag_tracker", "poses": "pose_tracker"}
 """Nodes that may run on another computer, by their keys in a hardware file."""
 BOARD_PARAMETERS = {"pneudrive": {"sensor_range": 103_400.0}}
 """Of boards of the twin: with sensors of 15 psi, a step is 0.13 kPa and not 0.84."""
 PAGE_TOKEN = secrets.token_urlsafe()
 """Opens the page of each run's graph, so that a window that is open stays let in."""
+POSE_RATE = 120.0
+"""Simulated motion capture tells poses so often [Hz]."""
 _PR_SET_PDEATHSIG = 1
 _LIBC = ctypes.CDLL(None)
 
@@ -59,6 +63,9 @@ class Hardware:
 
     Attributes:
         driver, tracker, planner, recorder: parameters by name for each node.
+        poses: parameters of the tracker of bodies, where motion capture stands in place of the
+            camera; None: the camera.
+        found: what scripts/check_rig.py has written; for people.
         remap: new names of topics by their old ones, for all nodes.
         hosts: computers on which somebody else starts a node, by its name; in the file, `host`
             stands in the place of the node's parameters.
@@ -67,6 +74,8 @@ class Hardware:
 
     driver: dict[str, Any] = field(default_factory=dict)
     tracker: dict[str, Any] = field(default_factory=dict)
+    poses: dict[str, Any] | None = None
+    found: tuple[str, ...] = ()
     planner: dict[str, Any] = field(default_factory=dict)
     recorder: dict[str, Any] = field(default_factory=dict)
     remap: dict[str, str] = field(default_factory=dict)
@@ -113,7 +122,7 @@ def _hosts(hardware: Hardware, path: Path) -> dict[str, str]:
     """
     hosts = {}
     for key, node in MOVABLE.items():
-        parameters = getattr(hardware, key)
+        parameters = getattr(hardware, key) or {}
         if "host" not in parameters:
             continue
         hosts[node] = str(parameters.pop("host"))
@@ -151,6 +160,8 @@ class GraphSetup:
         planner: parameters of the planner; None for a graph without one.
         record_images: whether the bag holds the raw images, too.
         page: port of the operator's page; None for a graph without one.
+        poses: simulated motion capture in place of the twin's camera.
+        wiring: of the twin, as its parameter; None: as everybody expects.
     """
 
     bag: Path
@@ -163,6 +174,8 @@ class GraphSetup:
     planner: dict[str, Any] | None = None
     record_images: bool = False
     page: int | None = None
+    poses: bool = False
+    wiring: tuple[int, ...] | None = None
 
     def nodes(self, port: str) -> list[NodeSpec]:
         """Return the nodes in the order in which they start; the emulated board is at ``port``."""
@@ -177,12 +190,24 @@ class GraphSetup:
             "record_images": self.record_images,
             **rig.recorder,
         }
+        poses = rig.poses
         specs = [NodeSpec("pressure_driver", "pressure_driver", driver)]
         if self.hardware is None:
             specs.insert(0, NodeSpec("pressure_driver", "board_emulator", board))
-            specs.append(NodeSpec("der_planner", "limb_twin", twin))
-            specs.append(NodeSpec("apriltag_tracker", "synthetic_camera", {"seed": self.seed}))
-        specs.append(NodeSpec("apriltag_tracker", "apriltag_tracker", dict(rig.tracker)))
+            if self.wiring is not None:
+                twin["wiring"] = list(self.wiring)
+            camera = NodeSpec("apriltag_tracker", "synthetic_camera", {"seed": self.seed})
+            if self.poses:
+                poses = {"form": "pose_array"}
+                twin["rate"] = POSE_RATE
+                camera = NodeSpec(
+                    "apriltag_tracker", "synthetic_poses", {"seed": self.seed, **poses}
+                )
+            specs += [NodeSpec("der_planner", "limb_twin", twin), camera]
+        if poses is not None:
+            specs.append(NodeSpec("apriltag_tracker", "pose_tracker", dict(poses)))
+        else:
+            specs.append(NodeSpec("apriltag_tracker", "apriltag_tracker", dict(rig.tracker)))
         planner = {**(self.planner or {}), **rig.planner}
         if self.planner is not None:
             specs.append(NodeSpec("der_planner", "planner", planner))

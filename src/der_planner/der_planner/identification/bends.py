@@ -326,3 +326,31 @@ class BendFit:
         # Each fitted unknown uses up one of them (degrees of freedom).
         left = max(independent - len(self.free.unknowns.prior), 0.2 * independent)
         return float((error / ANGLE_ERROR) ** 2 * length / CORRELATION * independent / left)
+
+    def delay(self, values: Array) -> tuple[float, float]:
+        """Return by how long what was seen is late, and its standard deviation [s].
+
+        A limb that is seen late by d shows θ(t − d) ≈ θ − d θ̇. That is one more column beside those
+        of the unknowns, which may take up a part of it: the two are solved for together. What a
+        pressure needs from its sensor to the limb is in it, too.
+
+        Args:
+            values: (P,) as found.
+
+        Raises:
+            RuntimeError: the model cannot follow the logs.
+        """
+        unknowns = self.free.unknowns
+        columns, errors = [], []
+        for log in self._logs:
+            part = predicted(self.free, self._model, log, values)
+            speed = np.gradient(part.angles, log.log.time, axis=0)
+            slopes = part.angles_by[log.usable].reshape(-1, len(values)) * unknowns.scale
+            columns.append(np.column_stack([-speed[log.usable].ravel(), slopes]))
+            errors.append((log.log.bend_angles - part.angles)[log.usable].ravel())
+        weight = 1.0 / (ANGLE_ERROR * np.sqrt(CORRELATION * self.excess(self.remaining(values))))
+        table, error = weight * np.concatenate(columns), weight * np.concatenate(errors)
+        known = np.where(unknowns.known, unknowns.scale / unknowns.spread, 0.0)
+        information = table.T @ table + np.diag(np.append(0.0, known**2))
+        covariance = np.linalg.pinv(information, hermitian=True)
+        return float(covariance[0] @ table.T @ error), float(np.sqrt(covariance[0, 0]))

@@ -128,6 +128,7 @@ def fit(
         span=np.ptp(prepared.bend[prepared.usable], axis=0),
         duration=float(np.ptp(prepared.log.time)),
         rows=int(prepared.usable.sum()),
+        delay=fitted.problem.delay(fitted.values),
         warnings=tuple(warnings),
     )
 

@@ -87,6 +87,12 @@ class CalibrationLog:
         rows = (self.time >= first) & (self.time <= last)
         return self._of(self.time[rows], lambda values: values[rows])
 
+    def parted(self, share: float) -> tuple[CalibrationLog, CalibrationLog]:
+        """Return the log without its last part, and that part; ``share`` is that of its time."""
+        edge = self.time[-1] - share * (self.time[-1] - self.time[0])
+        after = float(np.nextafter(edge, np.inf))
+        return self.between(self.time[0], edge), self.between(after, self.time[-1])
+
     def _of(self, time: Array, table: Callable[[Array], Array]) -> CalibrationLog:
         """Return the log at other instants, its tables changed by a function."""
         commanded, measured = table(self.commanded_differential), table(self.measured_differential)

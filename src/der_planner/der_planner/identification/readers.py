@@ -6,7 +6,7 @@ import codecs
 import csv
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from itertools import dropwhile
 from pathlib import Path
 from typing import Any
@@ -16,14 +16,19 @@ import yaml
 from numpy.typing import NDArray
 
 from der_planner.arrays import Array
-from der_planner.bags.reader import BagError
+from der_planner.bags.reader import BagError, BagReader
 from der_planner.bags.record import PRESSURE_TYPE, STATE_TYPE, LimbRecord, read_record
 from der_planner.bags.series import stream
+from der_planner.identification.foreign import (
+    LONGEST_SILENCE,
+    bends_of,
+    is_bag,
+    read_bag_table,
+    read_poses,
+)
 from der_planner.identification.log import CalibrationLog, LogError, on_grid
 from der_planner.model import CONTROL_PERIOD
 
-LONGEST_SILENCE = 0.25
-"""Time between two messages of a bag that a straight line may bridge [s]."""
 LEAST_MESSAGES = 10
 """Messages of pressures, and of valid limb states, that a bag must hold."""
 UNITS = {
@@ -37,6 +42,8 @@ REST_SHARE = 0.02
 """Share of a table's largest command below which commands count as rest."""
 VENTING_TIME = 5.0
 """Time that chambers need to be at rest after they were filled [s]."""
+TABLES = (".csv", ".tsv")
+"""Endings of the names of tables; what ends otherwise is a bag."""
 SEPARATORS = "\t;,"
 """Separators of columns; a table has the first of these that its header holds."""
 
@@ -86,9 +93,10 @@ class ColumnMap:
 
     Attributes:
         time: column of the time.
-        commanded: (M,) columns of commanded differential pressures.
+        commanded: (M,) columns of commanded differential pressures, or (2M,) of commanded chamber
+            pressures.
         chambers: (2M,) columns of measured chamber pressures: 0, 1 of segment 0, then of segment 1.
-        angles: (M,) columns of the segments' angles.
+        angles: (M,) columns of the segments' angles; left out where there are poses.
         tip: (2,) columns of x, y in `limb_base`; empty if there are none.
         tags: columns that repeat their last value, all of them, when a tag is lost; empty: never.
         time_unit, pressure_unit, angle_unit, length_unit: of `UNITS`.
@@ -97,12 +105,15 @@ class ColumnMap:
             the pressures; a log that does not rest then, and every log with the word ``auto``, has
             its longest rest looked for; 0 keeps the pressures as they are.
         ignore: (first, last) [s] stretches to leave out.
+        poses: table of motion capture in place of the angles; from the folder of the map.
+        bodies: body map of the poses; from the folder of the map.
+        poses_late: by which the clock of the poses is ahead of the table's [s].
     """
 
     time: str
     commanded: tuple[str, ...]
     chambers: tuple[str, ...]
-    angles: tuple[str, ...]
+    angles: tuple[str, ...] = ()
     tip: tuple[str, ...] = ()
     tags: tuple[str, ...] = ()
     time_unit: str = "s"
@@ -112,6 +123,9 @@ class ColumnMap:
     angle_factor: float = 1.0
     rest_until: float | str = 0.0
     ignore: tuple[tuple[float, float], ...] = ()
+    poses: str = ""
+    bodies: str = ""
+    poses_late: float = 0.0
 
     @classmethod
     def from_yaml(cls, path: str | Path) -> ColumnMap:
@@ -127,7 +141,8 @@ class ColumnMap:
         if not isinstance(content, Mapping):
             raise LogError(f"the column map {path} must hold keys and values")
         known, given = {item.name for item in fields(cls)}, set(content)
-        missing = {"time", "commanded", "chambers", "angles"} - given
+        seen = {"bodies"} if "poses" in given else {"angles"}
+        missing = ({"time", "commanded", "chambers"} | seen) - given
         wrong = sorted(given - known) + sorted(missing)
         if wrong:
             said = "missing" if wrong[0] in missing else "unknown"
@@ -140,6 +155,9 @@ class ColumnMap:
                 values[key] = reading(value)
             except (TypeError, ValueError) as error:
                 raise LogError(f"column map {path}: {key} is {value!r}, give {expected}") from error
+        for key in ("poses", "bodies"):
+            if key in values:
+                values[key] = str(Path(path).parent / values[key])
         return cls(**values)
 
     def factor(self, key: str) -> float:
@@ -170,6 +188,7 @@ _KINDS: dict[str, tuple[Callable[[Any], Any], str]] = {
         (_names, "a list of columns' names, as [name, name]"),
     ),
     "angle_factor": (float, "a number"),
+    "poses_late": (float, "a number of seconds"),
     "rest_until": (
         lambda value: value if value == "auto" else float(value),
         "a time in s, or auto",
@@ -186,9 +205,9 @@ def read_csv(path: str | Path, columns: ColumnMap) -> CalibrationLog:
         LogError: a column is missing or no number, a unit is unknown, or time falls; the message
             names it.
     """
-    table = read_table(Path(path))
-    count = len(columns.angles)
-    if len(columns.commanded) != count or len(columns.chambers) != 2 * count:
+    table = read_bag_table(Path(path)) if is_bag(Path(path)) else read_table(Path(path))
+    count = len(columns.chambers) // 2 if columns.poses else len(columns.angles)
+    if len(columns.commanded) not in (count, 2 * count) or len(columns.chambers) != 2 * count:
         raise LogError(
             f"the column map names {count} angles: it needs {count} commands and {2 * count} "
             f"chambers, got {len(columns.commanded)} and {len(columns.chambers)}"
@@ -205,8 +224,15 @@ def read_csv(path: str | Path, columns: ColumnMap) -> CalibrationLog:
     pressure = columns.factor("pressure_unit")
     time = columns.factor("time_unit") * pick((columns.time,))[:, 0]
     command, chambers = pressure * pick(columns.commanded), pressure * pick(columns.chambers)
-    angles = columns.factor("angle_unit") * columns.angle_factor * pick(columns.angles)
+    if len(columns.commanded) == 2 * count:
+        command = command[:, 0::2] - command[:, 1::2]
     tip = np.full((len(time), 2), np.nan)
+    if columns.poses:
+        poses = read_poses(Path(columns.poses))
+        poses = replace(poses, time=poses.time - columns.poses_late)
+        angles, tip = bends_of(poses, Path(columns.bodies), time)
+    else:
+        angles = columns.factor("angle_unit") * columns.angle_factor * pick(columns.angles)
     if columns.tip:
         tip = columns.factor("length_unit") * pick(columns.tip)
     measured = chambers[:, 0::2] - chambers[:, 1::2]
@@ -238,16 +264,25 @@ def read_csv(path: str | Path, columns: ColumnMap) -> CalibrationLog:
 
 
 def read_log(path: Path, columns: Path | None, namespace: str = "") -> CalibrationLog:
-    """Read a bag, or a table (CSV) by the map of its columns.
+    """Read a bag of ours, or anybody's bag or table (CSV) by the map of its columns.
 
     Raises:
         LogError: it cannot be read, or is a table without a map.
     """
-    if path.suffix != ".csv":
+    if path.suffix not in TABLES and (columns is None or is_ours(path)):
         return read_bag(path, namespace)
     if columns is None:
         raise LogError(f"{path} needs --columns FILE")
     return read_csv(path, ColumnMap.from_yaml(columns))
+
+
+def is_ours(path: Path) -> bool:
+    """Tell whether a bag is of our driver; one that cannot be read says why when it is read."""
+    try:
+        with BagReader(path) as bag:
+            return any(topic.type_name == PRESSURE_TYPE for topic in bag.topics.values())
+    except BagError:
+        return True
 
 
 def _rest(time: Array, command: Array, rest_until: float | str) -> NDArray[np.bool_]:

@@ -69,6 +69,7 @@ class FitReport:
         span: (M,) range of the measured bend angles [rad].
         duration: of the log [s].
         rows: used by the fit.
+        delay: by which what was seen is late, and its standard deviation [s].
         warnings: sentences.
     """
 
@@ -84,6 +85,7 @@ class FitReport:
     span: Array
     duration: float
     rows: int
+    delay: tuple[float, float] = (math.nan, math.nan)
     warnings: tuple[str, ...] = ()
 
     def value(self, name: str) -> Unknown:
@@ -120,6 +122,12 @@ class FitReport:
                 f"its range{other}"
             )
         lines += self._air_lines() + self._geometry_lines() + self._load_lines()
+        late, deviation = self.delay
+        if abs(late) > 3.0 * deviation:
+            lines.append(
+                f"what was seen is {1e3 * late:.0f} ± {1e3 * deviation:.0f} ms late: the trackers' "
+                f"parameter sensor_delay takes {late:.3f} s off their stamps"
+            )
         for i, j in np.argwhere(np.tril(np.abs(self.correlation) > STRONG, -1)):
             lines.append(
                 f"the log cannot tell {self.unknowns[i].name} and {self.unknowns[j].name} apart "

@@ -19,6 +19,7 @@ from der_msgs.msg import ChamberPressures, LimbPush, LimbShape, LimbState
 from der_planner.limb import PointMass
 from der_planner.twin import LimbTwin, Push, TwinError
 from der_planner.twin.limb_twin import BACKLOG, RealTimeLoop
+from der_planner.twin.wiring import Wiring
 from limb_interfaces import parameters, qos, stamps, topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
 from limb_interfaces.parameters import check_overrides
@@ -45,6 +46,10 @@ class LimbTwinNode(Node):
             "gain", 1.0, "of the chambers' moments, 1: as drawn; may be set at run time",
             at_least=0.0, at_most=2.0, read_only=False,
         )  # fmt: skip
+        wiring = read(
+            "wiring", [0], "chamber of each valve, from 1; minus: it bends the other way; 0: own"
+        )
+        self._wiring = None if list(wiring) == [0] else Wiring(tuple(map(int, wiring)))
         check_overrides(self)
         self._lock = threading.Lock()
         self._pressures: np.ndarray | None = None
@@ -104,7 +109,10 @@ class LimbTwinNode(Node):
             if self._pressures is None:
                 # The board starts vented, so its lowest chamber tells the air pressure of the room.
                 self._twin.atmosphere = float(pressures.min())
-            self._pressures = pressures
+            atmosphere = self._twin.atmosphere
+            self._pressures = (
+                pressures if self._wiring is None else self._wiring.felt(pressures, atmosphere)
+            )
             self._received_at = time.monotonic()
             self._messages += 1
         self._bad_message = ""

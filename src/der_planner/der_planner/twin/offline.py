@@ -13,6 +13,7 @@ from der_planner.limb import PointMass
 from der_planner.model.air import pair_of
 from der_planner.twin.body import Push, TwinError
 from der_planner.twin.limb_twin import LimbTwin
+from der_planner.twin.wiring import Wiring
 from pressure_driver.emulator.pneumatics import BoardPneumatics
 
 FINE_STEP = 0.01
@@ -49,6 +50,7 @@ class OfflineTwin:
         segment_count: M.
         gravity: (3,) acceleration in `limb_base` [m/s²].
         masses: what the limb carries from the start beside its own mass.
+        wiring: which chamber each valve fills; None: as everybody expects.
 
     Attributes:
         pneumatics, twin: the two of it.
@@ -65,7 +67,9 @@ class OfflineTwin:
         segment_count: int = 2,
         gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
         masses: Iterable[PointMass] = (),
+        wiring: Wiring | None = None,
     ) -> None:
+        self._wiring = wiring
         self.pneumatics = BoardPneumatics(segment_count=segment_count, seed=seed)
         atmosphere = self.pneumatics.atmosphere
         self.twin = LimbTwin(seed, run, atmosphere=atmosphere, gravity=gravity, masses=masses)
@@ -99,7 +103,10 @@ class OfflineTwin:
         """Let time pass [s] under the last command."""
         count = max(1, int(np.ceil(duration / FINE_STEP - 1e-9)))
         for _ in range(count):
-            self.twin.step(self.pneumatics.step(duration / count), duration / count)
+            air = self.pneumatics.step(duration / count)
+            if self._wiring is not None:
+                air = self._wiring.felt(air, self.pneumatics.atmosphere)
+            self.twin.step(air, duration / count)
 
     def advance(self, command: Array, duration: float) -> None:
         """Hold a command (M,) [Pa] for a time [s]."""

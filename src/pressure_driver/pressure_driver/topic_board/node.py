@@ -13,7 +13,7 @@ from functools import partial
 
 from rclpy.node import Node
 from sensor_msgs.msg import FluidPressure
-from std_msgs.msg import Float64MultiArray
+from std_msgs.msg import Float64MultiArray, Header
 
 from limb_interfaces import topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
@@ -40,24 +40,25 @@ class TopicBoard(Node):
         self._count = 2 * settings.segment_count
         firmware = NativeBoard(self._count, round(settings.largest_pressure), known=0)
         self._board = WatchedBoard(firmware, settings.atmosphere, self._publish)
-        self._told: list[float | None] = [None] * self._count
+        self._told: dict[int, list[float]] = {}
         self._refused = ""
-        arrays = settings.message == "Float64MultiArray"
-        kind = Float64MultiArray if arrays else FluidPressure
-        places = 1 if arrays else self._count
-        names = [settings.command_topic.replace("{}", str(place)) for place in range(places)]
-        heard = [settings.measured_topic.replace("{}", str(place)) for place in range(places)]
-        self._publishers = [self.create_publisher(kind, name, DEPTH) for name in names]
-        for place, name in enumerate(heard):
-            take = self._take_array if arrays else partial(self._take_one, place)
-            self.create_subscription(kind, name, take, DEPTH)
+        self._arrays = settings.message == "Float64MultiArray"
+        kind = Float64MultiArray if self._arrays else FluidPressure
+        self._regulators = []
+        for place in range(1 if self._arrays else self._count):
+            told, heard = settings.command_topic, settings.measured_topic
+            self._regulators.append(
+                self.create_publisher(kind, told.replace("{}", str(place)), DEPTH)
+            )
+            take = partial(self._take, place)
+            self.create_subscription(kind, heard.replace("{}", str(place)), take, DEPTH)
         self._socket = BoardSocket(settings.listen)
         self.create_timer(LOOK, self._serve)
         DiagnosticsPublisher(self, self._report, hardware_id=settings.listen)
 
     def _serve(self) -> None:
         now = time.monotonic()
-        self._socket.read(time.time_ns())
+        self._socket.read(0)
         for _, data in self._socket.arrived(0):
             self._socket.send(self._board.receive(data, now))
         self._socket.send(self._board.look(now))
@@ -65,40 +66,33 @@ class TopicBoard(Node):
 
     def _publish(self, gauge: Sequence[float]) -> None:
         values = self._scale.to_topic(gauge)
-        if len(self._publishers) == 1:
-            self._publishers[0].publish(Float64MultiArray(data=values))
+        header = Header(stamp=self.get_clock().now().to_msg())
+        for publisher, value in zip(self._regulators, values, strict=False):
+            publisher.publish(
+                Float64MultiArray(data=values)
+                if self._arrays
+                else FluidPressure(header=header, fluid_pressure=value)
+            )
+
+    def _take(self, place: int, message: Float64MultiArray | FluidPressure) -> None:
+        """Take pressures of one topic; the last of a set makes a report."""
+        values = message.data if self._arrays else [message.fluid_pressure]
+        self._told[place] = list(values)
+        if len(self._told) < len(self._regulators):
             return
-        stamp = self.get_clock().now().to_msg()
-        for publisher, value in zip(self._publishers, values, strict=True):
-            message = FluidPressure(fluid_pressure=value)
-            message.header.stamp = stamp
-            publisher.publish(message)
-
-    def _take_array(self, message: Float64MultiArray) -> None:
-        self._take(list(message.data))
-
-    def _take_one(self, place: int, message: FluidPressure) -> None:
-        """Take one chamber's pressure; the last of a set makes a report."""
-        self._told[place] = message.fluid_pressure
-        told = [value for value in self._told if value is not None]
-        if len(told) == self._count:
-            self._told = [None] * self._count
-            self._take(told)
-
-    def _take(self, told: list[float]) -> None:
+        told = [value for _, values in sorted(self._told.items()) for value in values]
+        self._told.clear()
         self._refused = ""
         if len(told) != self._count:
             self._refused = f"{len(told)} pressures are measured, there are {self._count} chambers"
             return
-        gauge = self._scale.from_topic(told)
-        self._socket.send(self._board.measured(gauge, time.monotonic()))
+        self._socket.send(self._board.measured(self._scale.from_topic(told), time.monotonic()))
         self._socket.pump(0)
 
     def _report(self) -> Health:
-        values = {"host_present": self._socket.host_present}
-        if self._refused:
-            return Health("error", self._refused, values)
-        return Health("ok", "regulating" if self._socket.host_present else "no driver", values)
+        present = self._socket.host_present
+        text = self._refused or ("regulating" if present else "no driver")
+        return Health("error" if self._refused else "ok", text, {"host_present": present})
 
     def close(self) -> None:
         """Vent, whoever may have died before, and leave the network."""

@@ -1,0 +1,173 @@
+"""Where `limb_base` is in the frame of the poses, and the plane in which the limb moves."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apriltag_tracker.bodies.body_map import BaseFrame, BodyMap
+
+Array = NDArray[np.float64]
+
+_MEMORY = 300
+"""Frames over which fixed bodies are averaged."""
+_ARM = 0.05
+"""Distance of the points that stand for the axes of a body whose rotation is known [m]."""
+_MISFIT = 0.003
+"""RMS distance at which fixed bodies do not fit together [m]."""
+_BUMP, _BUMP_FRAMES = 0.003, 3
+"""Way of the fixed bodies [m], and frames in a row, that mean that something was moved."""
+_LEAST_SPREAD = 0.005
+"""Points that are nearer to a line than this tell no frame [m]."""
+_LEAST_MOTION = 0.003
+"""RMS way across its main direction that a limb must move to show its plane [m]."""
+
+
+def fit_frame(points: Array, places: Array) -> tuple[BaseFrame, float] | None:
+    """Find the motion that brings points onto places best (Kabsch 1976).
+
+    Args:
+        points: (n, 3) m in one frame.
+        places: (n, 3) m in the other.
+
+    Returns:
+        The frame and the RMS distance that is left [m]; None if the points lie on a line.
+    """
+    if len(points) < 3:
+        return None
+    middle, centre = points.mean(axis=0), places.mean(axis=0)
+    left, spread, right = np.linalg.svd((places - centre).T @ (points - middle))
+    if math.sqrt(spread[1] / len(points)) < _LEAST_SPREAD:
+        return None
+    mirror = np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
+    rotation = left @ mirror @ right
+    frame = BaseFrame(rotation, centre - rotation @ middle)
+    gaps = frame.of(points) - places
+    return frame, float(np.sqrt(np.mean(np.sum(gaps**2, axis=1))))
+
+
+class BaseFinder:
+    """Keeps where `limb_base` is: from fixed bodies, averaged, or as the map says.
+
+    Args:
+        bodies: the body map.
+    """
+
+    def __init__(self, bodies: BodyMap) -> None:
+        self._index = [bodies.names.index(body.name) for body in bodies.fixed]
+        self._turned = np.array([body.rotation is not None for body in bodies.fixed], dtype=bool)
+        axes = [np.eye(3) if body.rotation is None else body.rotation for body in bodies.fixed]
+        places = np.array([body.position for body in bodies.fixed]).reshape(-1, 3)
+        self._places = _arms(places, np.array(axes).reshape(-1, 3, 3))
+        self._fixed = bodies.frame
+        self._mean, self._seen = np.zeros_like(self._places), np.zeros(len(self._index))
+        self._shifted = 0
+        self.frame = bodies.frame
+        self.residual = math.nan
+        """RMS distance of the fixed bodies from where the map has them [m]."""
+        self.bumps = 0
+        self.problem = ""
+        if bodies.frame is None:
+            self.problem = (
+                "no fixed body has been seen yet"
+                if self._index
+                else "the body map has neither fixed bodies nor a frame: add 'place: clamp' or "
+                "'place: world'"
+            )
+
+    def update(self, positions: Array, rotations: Array) -> BaseFrame | None:
+        """Take one frame of all bodies and return the base to use for it, None without one.
+
+        Args:
+            positions: (n, 3) m, in the order of the map's names; NaN for what was not seen.
+            rotations: (n, 3, 3) the bodies' axes, as columns.
+        """
+        points = _arms(positions[self._index], rotations[self._index])
+        seen = np.isfinite(points[:, 0, 0])
+        if self._fixed is not None or not seen.any():
+            return self.frame
+        known = seen & (self._seen > 0)
+        ways = np.linalg.norm(points[known, 0] - self._mean[known, 0], axis=1)
+        self._shifted = self._shifted + 1 if len(ways) and np.median(ways) > _BUMP else 0
+        if self._shifted >= _BUMP_FRAMES:
+            self.bumps += 1
+            self._shifted = 0
+            self._seen[:] = 0
+        self._seen[seen] = np.minimum(self._seen[seen] + 1, _MEMORY)
+        share = 1.0 / self._seen[seen, None, None]
+        self._mean[seen] += share * (points[seen] - self._mean[seen])
+        # The ends of the axes count where the map says how a body is turned.
+        used = (self._seen > 0)[:, None] & (np.arange(4) == 0)
+        used |= ((self._seen > 0) & self._turned)[:, None]
+        found = fit_frame(self._mean[used], self._places[used])
+        self.frame = None
+        if found is None:
+            self.problem = (
+                "the fixed bodies that are seen tell no frame: three that are not on a line, "
+                "or one with its rotation in the map, are needed"
+            )
+        elif found[1] > _MISFIT:
+            self.problem = (
+                f"the fixed bodies do not fit together ({1e3 * found[1]:.0f} mm): measure "
+                "their positions again, and check length_unit and names"
+            )
+        else:
+            (self.frame, self.residual), self.problem = found, ""
+        return self.frame
+
+
+def _arms(positions: Array, rotations: Array) -> Array:
+    """Return the origins of bodies and the ends of their axes, (n, 4, 3)."""
+    ends = positions[:, None] + _ARM * rotations.swapaxes(1, 2)
+    return np.concatenate([positions[:, None], ends], axis=1)
+
+
+class PlaneWatch:
+    """Finds the plane in which the bodies of a limb move, without keeping their ways.
+
+    Args:
+        count: of the bodies.
+    """
+
+    def __init__(self, count: int) -> None:
+        self._frames = np.zeros(count)
+        self._mean = np.zeros((count, 3))
+        self._scatter = np.zeros((3, 3))
+        self._furthest = 0.0
+
+    def take(self, places: Array) -> None:
+        """Take the places (count, 3) [m] of one frame; NaN for what was not seen."""
+        seen = np.isfinite(places).all(axis=1)
+        self._frames[seen] += 1.0
+        off = places[seen] - self._mean[seen]
+        self._mean[seen] += off / self._frames[seen, None]
+        self._scatter += off.T @ (places[seen] - self._mean[seen])
+        if seen.any():
+            self._furthest = max(self._furthest, float(np.abs(off[:, 2]).max()))
+
+    @property
+    def normal(self) -> Array | None:
+        """(3,) unit vector across the plane, z up; None before the limb has moved enough."""
+        total = self._frames.sum()
+        if total < 2:
+            return None
+        values, vectors = np.linalg.eigh(self._scatter / total)
+        if math.sqrt(max(values[1], 0.0)) < max(_LEAST_MOTION, 3.0 * math.sqrt(max(values[0], 0))):
+            return None
+        normal = np.asarray(vectors[:, 0], dtype=np.float64)
+        return normal if normal[2] >= 0.0 else -normal
+
+    def values(self) -> dict[str, object]:
+        """Return what to tell of it: its tilt against `limb_base`, how far bodies leave it."""
+        normal = self.normal
+        if normal is None:
+            return {"plane": "the limb has not moved enough to show its plane"}
+        out = math.sqrt(max(float(normal @ self._scatter @ normal), 0.0) / self._frames.sum())
+        return {
+            "plane_tilt_deg": f"{math.degrees(math.acos(min(1.0, normal[2]))):.2f}",
+            "plane_tilt_toward_deg": f"{math.degrees(math.atan2(normal[1], normal[0])):.0f}",
+            "out_of_plane_mm_rms": f"{1e3 * out:.2f}",
+            "height_mm_largest_change": f"{1e3 * self._furthest:.2f}",
+        }

@@ -1,0 +1,196 @@
+"""The body map: which tracked rigid body sits where on the limb and around it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from apriltag_tracker.tag_map import TagMapError, floats, limb_geometry, number, section
+
+SCHEMA_VERSION = 1
+LENGTH_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+"""[m] of each unit in which positions may come."""
+AXES = {
+    sign + name: factor * np.eye(3)[index]
+    for sign, factor in (("", 1.0), ("-", -1.0))
+    for index, name in enumerate("xyz")
+}
+"""Directions that may be called up."""
+_KEYS = {"name", "place", "arc_length", "position", "height", "offset", "rotation"}
+
+
+class BodyMapError(ValueError):
+    """The body map is incomplete or impossible; the message names file, key and remedy."""
+
+
+@dataclass(frozen=True)
+class BodyOnLimb:
+    """A rigid body on the limb.
+
+    Attributes:
+        name: as its tracker calls it.
+        arc_length: of its origin from the clamp along the centreline [m].
+        height: of its origin above the base plane [m].
+        offset: of its origin along and across the limb [m, m], and of its direction [rad], against
+            where `arc_length` says it is.
+        rotation: (3, 3) its axes, as columns, in the frame of the centreline there: x along the
+            limb, z up.
+    """
+
+    name: str
+    arc_length: float
+    height: float
+    offset: tuple[float, float, float]
+    rotation: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class FixedBody:
+    """A rigid body that does not move: on the clamp, or around the limb.
+
+    Attributes:
+        name: as its tracker calls it.
+        position: (3,) of its origin in `limb_base` [m].
+        rotation: (3, 3) its axes, as columns, in `limb_base`; None if they are not known.
+    """
+
+    name: str
+    position: NDArray[np.float64]
+    rotation: NDArray[np.float64] | None
+
+
+@dataclass(frozen=True)
+class BaseFrame:
+    """Where `limb_base` is in the frame of the poses: p_base = rotation p + translation [m]."""
+
+    rotation: NDArray[np.float64]
+    translation: NDArray[np.float64]
+
+    def of(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return points (n, 3) of the poses' frame [m] in `limb_base`."""
+        return np.asarray(points @ self.rotation.T + self.translation, dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class BodyMap:
+    """All bodies of a set-up.
+
+    Attributes:
+        segment_lengths: of the limb [m].
+        limb: bodies on it.
+        fixed: bodies on the clamp and around the limb.
+        names: of all bodies in the order in which the file lists them, which is that of a message
+            without names.
+        stiff: stretches of the limb that cannot bend, from and to in arc length [m].
+        unit: [m] of a unit of length of the poses.
+        up: (3,) direction of the poses' frame in which z of `limb_base` points, roughly.
+        frame: where `limb_base` is, for a set-up without enough fixed bodies; None: from these.
+    """
+
+    segment_lengths: tuple[float, ...]
+    limb: tuple[BodyOnLimb, ...]
+    fixed: tuple[FixedBody, ...]
+    names: tuple[str, ...]
+    stiff: tuple[tuple[float, float], ...] = ()
+    unit: float = 1.0
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    frame: BaseFrame | None = None
+
+    @property
+    def length(self) -> float:
+        """Arc length of the tip at rest [m]."""
+        return sum(self.segment_lengths)
+
+    @classmethod
+    def from_yaml(cls, path: str | Path) -> BodyMap:
+        """Read a body map.
+
+        Raises:
+            BodyMapError: the file is missing, is no YAML, or a key is missing or impossible.
+        """
+        try:
+            return cls.from_dict(yaml.safe_load(Path(path).read_text()))
+        except OSError as error:
+            raise BodyMapError(f"cannot read the body map {path}: {error.strerror}") from error
+        except yaml.YAMLError as error:
+            raise BodyMapError(f"the body map {path} is not YAML: {error}") from error
+        except (BodyMapError, TagMapError) as error:
+            raise BodyMapError(f"{path}: {error}") from error
+
+    @classmethod
+    def from_dict(cls, data: Any) -> BodyMap:
+        """Build a body map from the content of its file.
+
+        Raises:
+            BodyMapError, TagMapError: a key is missing or impossible.
+        """
+        if not isinstance(data, dict) or data.get("schema") != SCHEMA_VERSION:
+            raise BodyMapError(f"'schema: {SCHEMA_VERSION}' expected at the top of a body map")
+        lengths, stiff = limb_geometry(section(data, "limb"))
+        unit, up = str(data.get("length_unit", "m")), str(data.get("up", "z"))
+        for key, value, choices in (("length_unit", unit, LENGTH_UNITS), ("up", up, AXES)):
+            if value not in choices:
+                raise BodyMapError(f"{key} is '{value}': choose {', '.join(choices)}")
+        entries = data.get("bodies")
+        if not isinstance(entries, list):
+            raise BodyMapError("bodies: a list of entries 'name: …, arc_length: …' expected")
+        found = [_body(entry, sum(lengths)) for entry in entries]
+        names = tuple(body.name for body in found)
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise BodyMapError(f"bodies {', '.join(twice)} are listed twice: each has its own name")
+        limb = tuple(body for body in found if isinstance(body, BodyOnLimb))
+        if not limb:
+            raise BodyMapError("bodies: at least one must have an arc_length on the limb")
+        fixed = tuple(body for body in found if isinstance(body, FixedBody))
+        frame = data.get("frame")
+        return cls(
+            segment_lengths=lengths,
+            limb=limb,
+            fixed=fixed,
+            names=names,
+            stiff=stiff,
+            unit=LENGTH_UNITS[unit],
+            up=tuple(AXES[up].tolist()),
+            frame=None if frame is None else _frame(section(data, "frame")),
+        )
+
+
+def _body(entry: Any, total: float) -> BodyOnLimb | FixedBody:
+    if not isinstance(entry, dict) or not isinstance(entry.get("name"), str):
+        raise BodyMapError(f"bodies: an entry 'name: …, arc_length: …' expected, not {entry!r}")
+    name = f"body {entry['name']}"
+    if unknown := sorted(entry.keys() - _KEYS):
+        raise BodyMapError(f"{name}: unknown key '{unknown[0]}'; known: {', '.join(sorted(_KEYS))}")
+    turn = _rotation(entry["rotation"], name) if "rotation" in entry else None
+    if "arc_length" not in entry:
+        if entry.get("place") not in ("clamp", "world"):
+            raise BodyMapError(f"{name}: an arc_length, or 'place: clamp' or 'place: world' needed")
+        position = floats(entry.get("position"), 3, f"{name}: position")
+        return FixedBody(entry["name"], np.array(position), turn)
+    arc_length = number(entry["arc_length"], f"{name}: arc_length")
+    if not 0.0 <= arc_length <= total:
+        raise BodyMapError(f"{name}: arc_length {arc_length} m is not on the limb (0 to {total} m)")
+    along, across, angle = floats(entry.get("offset", [0.0, 0.0, 0.0]), 3, f"{name}: offset")
+    height = number(entry.get("height", 0.0), f"{name}: height")
+    rotation = np.eye(3) if turn is None else turn
+    return BodyOnLimb(entry["name"], arc_length, height, (along, across, angle), rotation)
+
+
+def _rotation(value: Any, name: str) -> NDArray[np.float64]:
+    quaternion = np.array(floats(value, 4, f"{name}: rotation"))
+    if not 0.99 < float(np.linalg.norm(quaternion)) < 1.01:
+        raise BodyMapError(f"{name}: rotation {value} is no quaternion x, y, z, w of length 1")
+    return np.asarray(Rotation.from_quat(quaternion).as_matrix(), dtype=np.float64)
+
+
+def _frame(entry: dict[str, Any]) -> BaseFrame:
+    """Read where the origin and the axes of `limb_base` are in the frame of the poses, in m."""
+    origin = np.array(floats(entry.get("position"), 3, "frame: position"))
+    rotation = _rotation(entry.get("rotation"), "frame").T
+    return BaseFrame(rotation, -rotation @ origin)

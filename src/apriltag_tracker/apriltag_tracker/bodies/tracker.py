@@ -1,0 +1,248 @@
+"""Poses of rigid bodies in, the limb out: the tracker of bodies without ROS."""
+
+from __future__ import annotations
+
+import bisect
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial.transform import Rotation
+
+from apriltag_tracker.bodies.base import BaseFinder, PlaneWatch
+from apriltag_tracker.bodies.body_map import BodyMap
+from apriltag_tracker.pose.following import Followed, FollowerOptions, LimbFollower
+from apriltag_tracker.pose.shape import CURVE_POINTS, PlanarTag, centreline_pose
+
+Array = NDArray[np.float64]
+
+_OPEN_FRAMES = 2
+"""A body that is missing is waited for until so many later frames have begun."""
+_FROZEN_FRAMES = 3
+"""A body whose pose has been the very same for so many frames while others moved is lost."""
+_CLOCK_SET = 1_000_000_000
+"""Stamps that go back by more than this are of a clock that was set [ns]."""
+_SWAP_AGE = 0.2
+"""Age of the last shape that tells which body is which [s]."""
+_SWAP_GAIN = 0.25
+"""Other names for the bodies are taken where they bring the distances down to this share."""
+
+
+class PoseFrame(NamedTuple):
+    """The bodies at one instant.
+
+    Attributes:
+        stamp: [ns].
+        positions: (n, 3) in the map's unit and the order of its names; NaN for what is missing.
+        quaternions: (n, 4) x, y, z, w.
+    """
+
+    stamp: int
+    positions: Array
+    quaternions: Array
+
+
+class FrameAssembler:
+    """Puts poses that come one body at a time together to frames.
+
+    A frame is complete when all bodies have come that came lately. Messages of one body keep their
+    order, those of different bodies may not: a few frames are open at a time.
+
+    Args:
+        bodies: the body map.
+        tolerance: stamps that are nearer than this belong to one frame [ns].
+    """
+
+    def __init__(self, bodies: BodyMap, tolerance: int = 1_000_000) -> None:
+        self._places = {name: place for place, name in enumerate(bodies.names)}
+        self._tolerance = tolerance
+        self._open: list[tuple[PoseFrame, set[int]]] = []
+        self._closed: int | None = None
+        self._expected = set(self._places.values())
+        self.unknown: dict[str, int] = {}
+        """Poses of bodies that are not in the map, by name."""
+
+    def take(self, name: str, stamp: int, pose: tuple[float, ...]) -> list[PoseFrame]:
+        """Take x, y, z and the quaternion x, y, z, w of a body; return the frames that end so."""
+        place = self._places.get(name)
+        if place is None:
+            self.unknown[name] = self.unknown.get(name, 0) + 1
+            return []
+        if self._closed is not None and stamp <= self._closed + self._tolerance:
+            if stamp > self._closed - _CLOCK_SET:
+                # Of a frame that was told already: the next one waits for this body, too.
+                self._expected.add(place)
+                return []
+            self._open, self._closed = [], None
+        at = bisect.bisect(self._open, stamp - self._tolerance - 1, key=lambda each: each[0].stamp)
+        if at == len(self._open) or self._open[at][0].stamp > stamp + self._tolerance:
+            count = len(self._places)
+            frame = PoseFrame(stamp, np.full((count, 3), np.nan), np.full((count, 4), np.nan))
+            self._open.insert(at, (frame, set()))
+        frame, given = self._open[at]
+        frame.positions[place], frame.quaternions[place] = pose[:3], pose[3:]
+        given.add(place)
+        if given >= self._expected:
+            # The bodies that an older one lacks have come with this one.
+            return self._close(at + 1)
+        if len(self._open) > _OPEN_FRAMES:
+            self._expected = set(self._open[0][1])
+            return self._close(1)
+        return []
+
+    def _close(self, count: int) -> list[PoseFrame]:
+        frames = [frame for frame, _ in self._open[:count]]
+        self._open, self._closed = self._open[count:], frames[-1].stamp
+        return frames
+
+
+@dataclass(frozen=True)
+class BodyNoise:
+    """Standard deviations of a pose from frame to frame: position [m] and direction [rad]."""
+
+    position: float = 1e-4
+    direction: float = 3e-3
+
+
+@dataclass(frozen=True)
+class BodyObservation:
+    """What one frame says about the limb.
+
+    Attributes:
+        followed: the limb.
+        places: (n, 3) x, y [m] and heading [rad] of the limb's bodies in `limb_base`, their own
+            axes turned as the map says; NaN for what is missing.
+    """
+
+    followed: Followed
+    places: Array
+
+
+class BodyTracker:
+    """Follows a limb through frames of poses.
+
+    Args:
+        bodies: the body map.
+        options: how the limb is followed; of the uncertainty all but the height counts.
+        noise: of the poses.
+    """
+
+    def __init__(
+        self,
+        bodies: BodyMap,
+        options: FollowerOptions | None = None,
+        noise: BodyNoise | None = None,
+    ) -> None:
+        self.bodies = bodies
+        self._options = options or FollowerOptions()
+        noise = noise or BodyNoise()
+        self._covariance = np.diag([noise.position, noise.position, noise.direction]) ** 2
+        self.base = BaseFinder(bodies)
+        self.plane = PlaneWatch(len(bodies.limb))
+        names = {place: body.name for place, body in enumerate(bodies.limb)}
+        self.follower = LimbFollower(bodies, names, self._options, "body", "in the poses")
+        self._index = [bodies.names.index(body.name) for body in bodies.limb]
+        self._arcs = np.array([body.arc_length for body in bodies.limb])
+        self._turns = np.array([body.rotation for body in bodies.limb])
+        self._before: Array | None = None
+        self._same = np.zeros(len(bodies.names), dtype=np.int64)
+        self.swapped = 0
+        """Frames in which bodies had each other's names."""
+
+    def observe(self, frame: PoseFrame) -> BodyObservation:
+        """Find the limb in one frame."""
+        stamp = frame.stamp * 1e-9
+        positions = self.bodies.unit * frame.positions
+        norms = np.linalg.norm(frame.quaternions, axis=1)
+        lost = ~(np.isfinite(positions).all(axis=1) & (np.abs(norms - 1.0) < 0.1))
+        lost |= self._frozen(frame)
+        rotations = np.tile(np.eye(3), (len(lost), 1, 1))
+        if not lost.all():
+            rotations[~lost] = Rotation.from_quat(frame.quaternions[~lost]).as_matrix()
+        positions = np.where(lost[:, None], np.nan, positions)
+        places = np.full((len(self._index), 3), np.nan)
+        base = self.base.update(positions, rotations)
+        if base is None:
+            return BodyObservation(Followed(None, f"no base: {self.base.problem}"), places)
+        points = base.of(positions[self._index])
+        axes = base.rotation @ rotations[self._index]
+        order = self._sort_out(points, stamp)
+        points, axes = points[order], axes[order] @ self._turns.transpose(0, 2, 1)
+        self.plane.take(points)
+        places[:, :2] = points[:, :2]
+        places[:, 2] = np.where(
+            np.isfinite(points[:, 0]), np.arctan2(axes[:, 1, 0], axes[:, 0, 0]), np.nan
+        )
+        seen = np.flatnonzero(np.isfinite(places).all(axis=1))
+        planar = [
+            PlanarTag(
+                int(k),
+                float(self._arcs[k]),
+                centreline_pose(places[k], self.bodies.limb[k].offset),
+                self._covariance,
+            )
+            for k in seen
+        ]
+        followed = self.follower.follow(planar, stamp, self._common_errors(places[seen]))
+        wrong = np.flatnonzero(order != np.arange(len(order)))
+        if len(wrong):
+            self.swapped += 1
+            names = ", ".join(self.bodies.limb[k].name for k in wrong)
+            said = f"bodies have each other's names: {names}"
+            reason = f"{followed.reason}; {said}" if followed.reason else said
+            followed = followed._replace(reason=reason)
+        return BodyObservation(followed, places)
+
+    def _frozen(self, frame: PoseFrame) -> NDArray[np.bool_]:
+        """Return which bodies keep their pose to the last digit while others move, (n,)."""
+        now = np.hstack([frame.positions, frame.quaternions])
+        if self._before is None:
+            self._before = now
+        same = (now == self._before).all(axis=1)
+        self._same = np.where(same, self._same + 1, 0)
+        self._before = now
+        frozen = self._same >= _FROZEN_FRAMES
+        return frozen if not frozen[np.isfinite(now).all(axis=1)].all() else np.zeros_like(frozen)
+
+    def _sort_out(self, points: Array, stamp: float) -> NDArray[np.int64]:
+        """Return whose pose each of the limb's bodies has, (m,): its own, if names are right.
+
+        A tracker that confuses bodies gives one the pose of another: where the last shape is well
+        explained so, and badly by the names, the names are wrong.
+        """
+        own = np.arange(len(points))
+        last = self.follower.last(stamp, _SWAP_AGE)
+        seen = np.flatnonzero(np.isfinite(points).all(axis=1))
+        if last is None or len(seen) < 2:
+            return own
+        along = np.linspace(0.0, self.bodies.length, CURVE_POINTS)
+        heading = np.unwrap(np.arctan2(*np.gradient(last.curve, axis=0).T[::-1]))
+        turn = np.interp(self._arcs, along, heading)
+        axes = np.stack([np.cos(turn), np.sin(turn)], axis=1)
+        sideways = axes[:, ::-1] * [-1.0, 1.0]
+        offsets = np.array([body.offset for body in self.bodies.limb])
+        middle = np.stack([np.interp(self._arcs, along, each) for each in last.curve.T], axis=1)
+        expected = (middle + offsets[:, :1] * axes + offsets[:, 1:2] * sideways)[seen]
+        distances = np.linalg.norm(expected[:, None] - points[None, seen, :2], axis=2)
+        rows, columns = linear_sum_assignment(distances)
+        if distances[rows, columns].sum() < _SWAP_GAIN * np.trace(distances):
+            own[seen[rows]] = seen[columns]
+        return own
+
+    def _common_errors(self, places: Array) -> Array:
+        """Return how bodies move with the survey's shift in x and y and its turn, (n, 3, 3)."""
+        survey, fixed = self._options.uncertainty.survey, self.bodies.fixed
+        spread = self.bodies.length
+        if len(fixed) > 1:
+            positions = np.array([body.position[:2] for body in fixed])
+            spread = float(np.sqrt(np.sum((positions - positions.mean(axis=0)) ** 2)))
+        shift = survey / math.sqrt(max(len(fixed), 1))
+        turn = survey / max(spread, 0.01)
+        moves = np.zeros((len(places), 3, 3))
+        moves[:, 0, 0] = moves[:, 1, 1] = shift
+        moves[:, 0, 2], moves[:, 1, 2] = -turn * places[:, 1], turn * places[:, 0]
+        moves[:, 2, 2] = turn
+        return moves

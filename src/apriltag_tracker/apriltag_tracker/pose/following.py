@@ -1,0 +1,197 @@
+"""The limb from picture to picture: fitted, bridged where it is hidden, told with what is amiss.
+
+The pictures' bodies may be tags of a camera or rigid bodies of a motion capture system.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apriltag_tracker.pose.shape import (
+    LimbEstimate,
+    LimbGeometry,
+    PlanarTag,
+    ShapeFitter,
+    ShapePrior,
+)
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """Standard deviations of what averaging does not remove.
+
+    Attributes:
+        survey: of the positions of fixed tags or bodies [m].
+        height: of the limb tags' heights [m].
+        mounting: of the positions of tags or bodies on the limb [m].
+        mounting_angle: of their directions [rad].
+    """
+
+    survey: float = 3e-4
+    height: float = 5e-4
+    mounting: float = 2e-4
+    mounting_angle: float = 5e-3
+
+
+@dataclass(frozen=True)
+class FollowerOptions:
+    """How the limb is followed.
+
+    Attributes:
+        bridge_frames: frames without a tip that are bridged from the motion before.
+        reject_beyond: distance from the others' shape at which one is on the wrong place [m].
+        largest_tip_sigma: standard deviation of the tip, noise and systematic together, above which
+            it is not told [m].
+        uncertainty: what averaging does not remove.
+        prior: how the limb may differ from ideal.
+    """
+
+    bridge_frames: int = 5
+    reject_beyond: float = 0.004
+    largest_tip_sigma: float = 0.01
+    uncertainty: Uncertainty = field(default_factory=Uncertainty)
+    prior: ShapePrior = field(default_factory=ShapePrior)
+
+
+class Followed(NamedTuple):
+    """What one picture says about the limb.
+
+    Attributes:
+        estimate: the limb; None if it cannot be told.
+        reason: why there is no estimate, or what was bridged or left out.
+        bridged: the estimate continues earlier motion; nothing of the limb was seen.
+    """
+
+    estimate: LimbEstimate | None
+    reason: str
+    bridged: bool = False
+
+
+class LimbFollower:
+    """Fits the limb to what is seen of it, picture after picture.
+
+    Args:
+        geometry: of the limb.
+        names: of everything that can be seen on it, by id.
+        options: how it works.
+        noun: what is seen: ``tag`` or ``body``.
+        place: where it is seen: ``in the image``.
+    """
+
+    def __init__(
+        self,
+        geometry: LimbGeometry,
+        names: Mapping[int, str],
+        options: FollowerOptions,
+        noun: str = "tag",
+        place: str = "in the image",
+    ) -> None:
+        self._names = names
+        self._options = options
+        self._noun, self._place = noun, place
+        uncertainty = options.uncertainty
+        self._fitter = ShapeFitter(
+            geometry,
+            options.prior,
+            options.reject_beyond,
+            uncertainty.mounting,
+            uncertainty.mounting_angle,
+        )
+        self._history: list[tuple[float, LimbEstimate]] = []
+        self._bridged = 0
+        self.misplaced = 0
+        """What was left out so far because it was on the wrong place."""
+
+    def last(self, stamp: float, age: float) -> LimbEstimate | None:
+        """Return the last estimate that was seen less than ``age`` [s] before a stamp [s]."""
+        if not self._history or not 0.0 <= stamp - self._history[-1][0] < age:
+            return None
+        return self._history[-1][1]
+
+    def follow(
+        self,
+        seen: Sequence[PlanarTag],
+        stamp: float,
+        common: NDArray[np.float64] | None = None,
+        shared_noise: NDArray[np.float64] | None = None,
+    ) -> Followed:
+        """Take one picture.
+
+        Args:
+            seen: what was seen of the limb, each id once.
+            stamp: of the picture [s].
+            common: as of `ShapeFitter.fit`.
+            shared_noise: as of `ShapeFitter.fit`.
+        """
+        estimate = self._fitter.fit(seen, common, shared_noise) if seen else None
+        if estimate is None:
+            return self._bridge(stamp, bool(seen))
+        self.misplaced += len(estimate.rejected)
+        sigma = estimate.tip_sigma
+        if sigma > self._options.largest_tip_sigma:
+            self._history.clear()
+            return Followed(
+                None, f"the tip is known to {1e3 * sigma:.0f} mm only; {self._remark(estimate)}"
+            )
+        self._bridged = 0
+        if self._history and stamp <= self._history[-1][0]:
+            self._history.clear()
+        self._history = [*self._history[-1:], (stamp, estimate)]
+        return Followed(estimate, self._remark(estimate))
+
+    def _remark(self, estimate: LimbEstimate) -> str:
+        parts = []
+        if estimate.rejected:
+            wrong = ", ".join(
+                f"{self._names[each]} ({1e3 * distance:.0f} mm off)"
+                for each, distance in estimate.rejected.items()
+            )
+            parts.append(f"{self._noun} on the wrong place, left out: {wrong}")
+        unseen = [
+            name
+            for each, name in self._names.items()
+            if each not in estimate.tags_used and each not in estimate.rejected
+        ]
+        if unseen:
+            parts.append(f"without {self._noun} {', '.join(unseen)}")
+        return "; ".join(parts)
+
+    def _bridge(self, stamp: float, inconsistent: bool) -> Followed:
+        """Continue the last motion for a few frames, with a covariance that grows."""
+        cause = (
+            f"what is seen of the limb contradicts itself: is each {self._noun} where the map says?"
+            if inconsistent
+            else f"no limb {self._noun} {self._place}"
+        )
+        self._bridged += 1
+        if self._bridged > self._options.bridge_frames or len(self._history) < 2:
+            self._history.clear()
+            self._fitter.reset()
+            return Followed(None, cause)
+        (before, old), (last, new) = self._history
+        share = (stamp - last) / (last - before)
+        # How wrong the continuation can be: as far as the limb went meanwhile, and a millimetre.
+        slip = (new.tip - old.tip) * share
+        growth = np.outer(slip, slip) + 1e-6 * np.eye(2)
+        estimate = LimbEstimate(
+            tip=new.tip + slip,
+            tip_covariance=new.tip_covariance + growth,
+            tip_systematic=new.tip_systematic,
+            tip_heading=new.tip_heading + (new.tip_heading - old.tip_heading) * share,
+            bend_angle=new.bend_angle + (new.bend_angle - old.bend_angle) * share,
+            bend_angle_sigma=new.bend_angle_sigma
+            + np.abs(new.bend_angle - old.bend_angle) * share
+            + 0.01,
+            curvature=new.curvature + (new.curvature - old.curvature) * share,
+            elongation=new.elongation,
+            residual=new.residual,
+            curve=new.curve + (new.curve - old.curve) * share,
+            tags_used=(),
+        )
+        frames = "frame" if self._bridged == 1 else "frames"
+        return Followed(estimate, f"bridged {self._bridged} {frames}: {cause}", bridged=True)

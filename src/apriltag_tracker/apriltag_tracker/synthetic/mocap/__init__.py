@@ -1,0 +1,1 @@
+"""The node that tells the poses of the twin."""

@@ -1,0 +1,109 @@
+"""What motion capture would tell of a simulated limb, with what goes wrong in real systems."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from apriltag_tracker.bodies.body_map import BodyMap
+from apriltag_tracker.bodies.tracker import PoseFrame
+from apriltag_tracker.synthetic.shapes import Shape
+
+_ORIGIN = np.array([0.4, -0.2, 0.9])
+"""Where the clamp is in the frame of the poses [m]."""
+
+
+@dataclass(frozen=True)
+class MocapFaults:
+    """What the poses have of a real system; nothing of it by default.
+
+    Attributes:
+        position_noise: standard deviation of a coordinate [m].
+        direction_noise: standard deviation of a turn about each axis [rad].
+        dropout: share of frames in which a body is lost, each for itself.
+        swapped: names of two bodies that have each other's names; empty: none.
+        swapped_from: when this begins, since the first frame [s].
+        delay: by which stamps are late [s].
+    """
+
+    position_noise: float = 0.0
+    direction_noise: float = 0.0
+    dropout: float = 0.0
+    swapped: tuple[str, ...] = ()
+    swapped_from: float = 0.0
+    delay: float = 0.0
+
+
+class SyntheticMocap:
+    """Tells the poses of the bodies on and around a limb.
+
+    Args:
+        bodies: the body map; poses come in its unit, and with its axis up.
+        faults: what is wrong with them.
+        turn: of `limb_base` about the axis that is up, in the frame of the poses [rad].
+        tilt: of the plane of motion against the floor [rad].
+        seed: of noise and dropouts.
+
+    Raises:
+        ValueError: a body that is to be swapped is not in the map.
+    """
+
+    def __init__(
+        self,
+        bodies: BodyMap,
+        faults: MocapFaults | None = None,
+        turn: float = 0.3,
+        tilt: float = 0.0,
+        seed: int = 0,
+    ) -> None:
+        self.bodies, self.faults = bodies, faults or MocapFaults()
+        for name in self.faults.swapped:
+            if name not in bodies.names:
+                raise ValueError(f"no body '{name}' to swap: there are {', '.join(bodies.names)}")
+        self._random = np.random.default_rng(seed)
+        first = int(np.argmax(np.abs(bodies.up)))
+        beside = np.eye(3)[(first + 1) % 3]
+        up = np.array(bodies.up)
+        level = np.column_stack([beside, np.cross(up, beside), up])
+        # limb_base in the frame of the poses
+        self.rotation: NDArray[np.float64] = (
+            level @ Rotation.from_euler("zx", [turn, tilt]).as_matrix()
+        )
+        self._started: int | None = None
+
+    def frame(self, stamp: int, shape: Shape) -> PoseFrame:
+        """Return the poses of all bodies at an instant [ns] in which the limb has a shape."""
+        if self._started is None:
+            self._started = stamp
+        faults, bodies = self.faults, self.bodies
+        fixed = {body.name: body for body in bodies.fixed}
+        limb = {body.name: body for body in bodies.limb}
+        count = len(bodies.names)
+        positions, axes = np.empty((count, 3)), np.empty((count, 3, 3))
+        for k, name in enumerate(bodies.names):
+            if name in fixed:
+                positions[k] = fixed[name].position
+                turned = fixed[name].rotation
+                axes[k] = np.eye(3) if turned is None else turned
+                continue
+            body = limb[name]
+            x, y, heading = shape.at(body.arc_length)
+            along, across, turn = body.offset
+            about = Rotation.from_euler("z", heading).as_matrix()
+            positions[k] = np.array([x, y, body.height]) + about @ np.array([along, across, 0.0])
+            axes[k] = about @ Rotation.from_euler("z", turn).as_matrix() @ body.rotation
+        positions = positions @ self.rotation.T + _ORIGIN
+        positions += faults.position_noise * self._random.standard_normal((count, 3))
+        noise = faults.direction_noise * self._random.standard_normal((count, 3))
+        turns = Rotation.from_matrix(self.rotation @ axes) * Rotation.from_rotvec(noise)
+        quaternions = np.asarray(turns.as_quat(), dtype=np.float64)
+        lost = self._random.random(count) < faults.dropout
+        positions[lost] = np.nan
+        since = (stamp - self._started) * 1e-9
+        if faults.swapped and since >= faults.swapped_from:
+            pair = [bodies.names.index(name) for name in faults.swapped]
+            positions[pair], quaternions[pair] = positions[pair[::-1]], quaternions[pair[::-1]]
+        return PoseFrame(stamp + round(1e9 * faults.delay), positions / bodies.unit, quaternions)

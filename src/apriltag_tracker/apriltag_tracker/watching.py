@@ -1,0 +1,121 @@
+"""What a tracker tells of the stream that it follows: rate, latency, counts, silence."""
+
+from __future__ import annotations
+
+import collections
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+SILENCE = 2.0
+"""Without an image or a frame of poses for this long [s] something is wrong."""
+_WINDOW = 300
+
+
+class StampGaps:
+    """Counts what is missing between the stamps of a stream of nearly constant rate.
+
+    The period is the interval below which a tenth of the last `window` ones lie: so even if most
+    messages are lost, the few neighbours that both arrive tell it. A gap of k periods is k − 1
+    missed messages; one longer than ``pause`` is a source that paused, and counts none.
+
+    Args:
+        window: intervals that tell the period.
+        pause: [s].
+    """
+
+    def __init__(self, window: int = 100, pause: float = 5.0) -> None:
+        self._intervals: collections.deque[int] = collections.deque(maxlen=window)
+        self._pause = round(pause * 1e9)
+        self._newest = 0
+        self.missed = 0
+        """Messages that did not arrive between those that did."""
+
+    def take(self, stamp: int) -> None:
+        """Take the stamp [ns] of a message; zero means nothing, one that goes back begins anew."""
+        if stamp <= 0:
+            return
+        before, self._newest = self._newest, stamp
+        interval = stamp - before
+        if before == 0 or not 0 < interval <= self._pause:
+            return
+        self._intervals.append(interval)
+        if len(self._intervals) >= 2:
+            period = sorted(self._intervals)[len(self._intervals) // 10]
+            self.missed += round(interval / period) - 1
+
+
+@dataclass(frozen=True)
+class StreamReport:
+    """Level (`ok`, `warning`, `error`, `stale`), a sentence, and numbers by name."""
+
+    level: str
+    message: str
+    values: dict[str, object]
+
+
+class StreamWatch:
+    """Counts what comes and the states that are made of it, and tells of silence.
+
+    Args:
+        source: where it comes from, for the messages: a topic's name, a device or a file.
+        noun: what comes: ``image`` or ``frame``.
+        clock: a steady clock [s].
+    """
+
+    def __init__(self, source: str, noun: str, clock: Callable[[], float] = time.monotonic) -> None:
+        self._source = source
+        self._noun = noun
+        self._clock = clock
+        self._started = clock()
+        self.received = self.processed = self.failed = 0
+        self.repeated = self.invalid = self.bridged = 0
+        self._arrivals: collections.deque[float] = collections.deque(maxlen=_WINDOW)
+        self._latency: collections.deque[float] = collections.deque(maxlen=_WINDOW)
+        self._work: collections.deque[float] = collections.deque(maxlen=_WINDOW)
+
+    def arrived(self) -> None:
+        """One came."""
+        self.received += 1
+        self._arrivals.append(self._clock())
+
+    def counted(self, valid: bool, bridged: bool, latency: float, work: float) -> None:
+        """One was processed; latency from its stamp and time of the work in s."""
+        self.processed += 1
+        self.invalid += not valid
+        self.bridged += bridged
+        self._latency.append(latency)
+        self._work.append(work)
+
+    def silence(self) -> str:
+        """Return what to say of a stream that is silent, or nothing."""
+        silent = self._clock() - (self._arrivals[-1] if self._arrivals else self._started)
+        if self._arrivals and silent <= SILENCE:
+            return ""
+        return f"no {self._noun} from {self._source} for {silent:.0f} s"
+
+    @property
+    def silence_level(self) -> str:
+        """``stale`` before the first, ``error`` for a stream that stopped."""
+        return "error" if self._arrivals else "stale"
+
+    def values(self) -> dict[str, object]:
+        """Return the numbers by name."""
+        values: dict[str, object] = {
+            f"{self._noun}s_received": self.received,
+            f"{self._noun}s_processed": self.processed,
+            f"{self._noun}s_failed": self.failed,
+            "repeated_stamps": self.repeated,
+            "states_invalid": self.invalid,
+            "states_bridged": self.bridged,
+        }
+        if len(self._arrivals) > 1 and self._arrivals[-1] > self._arrivals[0]:
+            rate = (len(self._arrivals) - 1) / (self._arrivals[-1] - self._arrivals[0])
+            values["rate_hz"] = f"{rate:.1f}"
+        for name, kept in (("latency", self._latency), ("processing", self._work)):
+            if kept:
+                values[f"{name}_ms_median"] = f"{1e3 * float(np.median(kept)):.2f}"
+                values[f"{name}_ms_p99"] = f"{1e3 * float(np.percentile(kept, 99)):.2f}"
+        return values

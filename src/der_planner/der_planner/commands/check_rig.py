@@ -1,0 +1,226 @@
+"""Find how a rig is put together: which hose goes where, what reads it, how fast, who sits where.
+
+    python3 scripts/check_rig.py --hardware my_rig.yaml --out my_checked_rig.yaml
+    python3 scripts/check_rig.py --bag checks/DATE/bag --out my_checked_rig.yaml
+    python3 scripts/check_rig.py --seed 3 --wiring 3 4 2 1                   # the twin's graph
+
+Each chamber is filled gently, alone, for three seconds: half a minute for two segments. The rig
+file that is written is the one that was given, with the wiring that was found for the driver, and
+what was found in the section `found`; experiments take it by --hardware. Exit code 0: the rig can
+be played; 3: it contradicts itself, and no file is written; 1: an error; 2: bad options.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from apriltag_tracker.bodies.body_map import BodyMap, BodyMapError
+from apriltag_tracker.pose.clamp import Clamp, find_clamp
+from apriltag_tracker.tag_map import LimbTag, TagMap, TagMapError
+from der_planner.bags.reader import BagError, BagReader
+from der_planner.bags.record import PRESSURE_TYPE, Columns, header_stamp
+from der_planner.experiment.console import (
+    OptionError,
+    Progress,
+    check_file,
+    check_folder,
+    command_parser,
+    interrupt_once,
+    run_command,
+)
+from der_planner.experiment.processes import GraphError, Hardware, NodeError
+from der_planner.identification.excitation import within_limits
+from der_planner.identification.rig import GENTLE, RigError, RigFinding, RigLog, check_run, find_rig
+from der_planner.limb import Limb
+from der_planner.twin import TwinError
+from der_planner.twin.wiring import Wiring
+from pressure_driver.hoses import HoseError, Hoses
+from pressure_driver.settings import Settings
+
+TAGS_TYPE = "der_msgs/msg/TagDetectionArray"
+CLAMP_OFF = (0.002, 0.002, float(np.deg2rad(1.5)))
+"""What the clamp may be beside the origin of `limb_base` [m, m, rad]."""
+SEEN_TOGETHER = 10
+"""Messages of each kind that a bag must hold."""
+
+
+def main() -> int:
+    """Run the command line."""
+    given = _parser().parse_args()
+    errors = (RigError, BagError, BodyMapError, TagMapError, TwinError, GraphError, NodeError)
+    return run_command(lambda: _main(given), *errors, OSError, stopped="no rig file was written")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = command_parser(__doc__)
+    parser.add_argument("--hardware", type=Path, metavar="FILE", help="rig file to begin with")
+    parser.add_argument("--bag", type=Path, help="judge a check that was recorded before")
+    parser.add_argument(
+        "--pressure", type=float, default=GENTLE, help=f"of the fills [Pa] (default: {GENTLE:.0f})"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="of the twin (default: 0)")
+    parser.add_argument(
+        "--wiring",
+        type=int,
+        nargs="+",
+        metavar="CHAMBER",
+        help="of the twin: the chamber that each valve fills, from 1; minus: bends the other way",
+    )
+    parser.add_argument("--poses", action="store_true", help="of the twin: motion capture, no tags")
+    parser.add_argument("--folder", type=Path, help="for bag and logs (default: checks/ and time)")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="rig file to write")
+    return parser
+
+
+def _main(given: argparse.Namespace) -> int:
+    hardware = Hardware.from_yaml(given.hardware) if given.hardware else None
+    if hardware is not None and (given.wiring or given.poses):
+        raise OptionError("--wiring and --poses are about the twin: leave --hardware out")
+    if not 500.0 <= given.pressure <= 20_000.0:
+        raise OptionError(f"--pressure is {given.pressure:g} Pa: choose 500 to 20000")
+    if given.out is not None:
+        check_file(given.out)
+    bag = given.bag or _play(given, hardware)
+    bodies = _bodies(given, hardware)
+    log = read_check(bag, bodies)
+    finding = find_rig(log)
+    lines = finding.lines()
+    offsets = [body.offset for body in bodies.limb]
+    clamp = find_clamp(bodies, log.arc_lengths, offsets, log.places)
+    if clamp is not None and not finding.contradictions:
+        lines += clamp_lines(clamp)
+    print("\n".join(lines))
+    driver = dict(hardware.driver) if hardware else {}
+    try:
+        driver["wiring"] = played_wiring(finding, str(driver.get("wiring", "")))
+    except (HoseError, RigError) as error:
+        print(f"no file is written: {error}", file=sys.stderr)
+        return 3
+    if given.out is not None:
+        content = yaml.safe_load(given.hardware.read_text()) if given.hardware else {}
+        content |= {"driver": driver, "found": lines}
+        given.out.parent.mkdir(parents=True, exist_ok=True)
+        given.out.write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True))
+        print(f"rig file: {given.out}")
+    return 0
+
+
+def clamp_lines(clamp: Clamp) -> list[str]:
+    """Say where the limb begins, and what to do where that is not the origin."""
+    (x, y, turn), (x_sigma, y_sigma, turn_sigma) = clamp.place, clamp.sigma
+    lines = [
+        f"clamp in limb_base: x {1e3 * x:.1f} ± {1e3 * x_sigma:.1f} mm, y {1e3 * y:.1f} ± "
+        f"{1e3 * y_sigma:.1f} mm, turned by {np.degrees(turn):.1f} ± {np.degrees(turn_sigma):.1f}°"
+    ]
+    if (np.abs(clamp.place) > np.maximum(CLAMP_OFF, 3.0 * clamp.sigma)).any():
+        lines.append(
+            "warning: limb_base is not at the clamp: take this off the positions of the fixed tags "
+            "or bodies in their map"
+        )
+    return lines
+
+
+def _play(given: argparse.Namespace, hardware: Hardware | None) -> Path:
+    """Play a check on the graph; return its bag."""
+    # ROS is imported only by who needs it.
+    from der_planner.experiment.graph_trials import play_calibration  # noqa: PLC0415
+
+    interrupt_once()
+    folder = given.folder or Path("checks") / time.strftime("%Y-%m-%d_%H-%M-%S")
+    check_folder(folder, "--folder")
+    driver = {**vars(Settings()), **(hardware.driver if hardware else {})}
+    count, limit = int(driver["segment_count"]), float(driver["pressure_limit"])
+    run = within_limits(check_run(count, given.pressure), limit, float(driver["slew_limit"]))
+    wiring = Wiring(tuple(given.wiring)).chambers if given.wiring else None
+    return play_calibration(
+        run, folder.resolve(), Progress(), Limb.default(), given.seed, hardware, wiring, given.poses
+    )
+
+
+def _bodies(given: argparse.Namespace, hardware: Hardware | None) -> TagMap | BodyMap:
+    """Return the map of the tags or bodies that the tracker of the check has."""
+    # Only with ROS there is a share folder to look in.
+    from ament_index_python.packages import get_package_share_directory  # noqa: PLC0415
+
+    share = Path(get_package_share_directory("apriltag_tracker")) / "config"
+    if given.poses or (hardware is not None and hardware.poses is not None):
+        poses = (hardware.poses if hardware else None) or {}
+        return BodyMap.from_yaml(poses.get("body_map", share / "bodies.yaml"))
+    tracker = hardware.tracker if hardware else {}
+    return TagMap.from_yaml(tracker.get("tag_map", share / "tags.yaml"))
+
+
+def played_wiring(finding: RigFinding, before: str) -> str:
+    """Return the driver's parameter ``wiring`` for what was found.
+
+    Args:
+        finding: of a check that was played with the driver's present wiring.
+        before: that wiring; empty: each chamber its own valve.
+
+    Raises:
+        HoseError: the driver cannot play it; says which hoses to swap.
+        RigError: the rig contradicts itself.
+    """
+    chambers = finding.wiring
+    valves = [int(word) for word in before.replace(",", " ").split()]
+    valves = valves or list(range(1, len(chambers) + 1))
+    found = ",".join(str(valves[channel]) for channel in chambers)
+    Hoses(found, len(chambers) // 2)
+    return found
+
+
+def read_check(path: Path, bodies: TagMap | BodyMap) -> RigLog:
+    """Read the log of a check from its bag.
+
+    Raises:
+        RigError: it holds no pressures, or nothing was seen of the limb.
+        BagError: the bag cannot be read.
+    """
+    # The id of a body is its place in the map.
+    limb = {
+        body.id if isinstance(body, LimbTag) else place: place
+        for place, body in enumerate(bodies.limb)
+    }
+    commands, measured, opening, places = Columns(), Columns(), Columns(), Columns()
+    with BagReader(path) as bag:
+        kinds = {name: topic.type_name for name, topic in bag.topics.items()}
+        wanted = [name for name, kind in kinds.items() if kind in (PRESSURE_TYPE, TAGS_TYPE)]
+        for name, _, message in bag.messages(wanted):
+            stamp = header_stamp(message)
+            if kinds[name] == PRESSURE_TYPE:
+                commands.append(stamp, message.commanded_differential)
+                measured.append(stamp, message.measured_chamber)
+                opening.append(stamp, message.valve_opening)
+                continue
+            row = np.full((len(limb), 3), np.nan)
+            for each in message.detections:
+                if each.pose_valid and each.id in limb:
+                    row[limb[each.id]] = each.pose.x, each.pose.y, each.pose.theta
+            places.append(stamp, row.ravel())
+    for kind, columns in (("pressures", commands), ("tags or bodies", places)):
+        if len(columns) < SEEN_TOGETHER:
+            raise RigError(f"the bag {path} holds no {kind}: were driver and tracker running?")
+    count, first = len(bodies.segment_lengths), commands.stamps()[0]
+    seen = places.values(3 * len(limb)).reshape(-1, len(limb), 3)
+    for column in seen[..., 2].T:
+        known = np.isfinite(column)
+        column[known] = np.unwrap(column[known])
+    return RigLog(
+        time=1e-9 * (commands.stamps() - first),
+        command=np.nan_to_num(commands.values(count)),
+        measured=measured.values(2 * count),
+        opening=opening.values(2 * count),
+        seen_time=1e-9 * (places.stamps() - first),
+        places=seen,
+        names=tuple(
+            str(body.id if isinstance(body, LimbTag) else body.name) for body in bodies.limb
+        ),
+        arc_lengths=np.array([body.arc_length for body in bodies.limb]),
+        segment_lengths=bodies.segment_lengths,
+    )

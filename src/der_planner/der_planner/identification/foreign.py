@@ -1,0 +1,255 @@
+"""Logs of other programs: tables of motion capture, bags with other messages, and what to ask."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from scipy.spatial.transform import Rotation
+
+from apriltag_tracker.bodies.body_map import BodyMap, BodyMapError
+from apriltag_tracker.bodies.tracker import BodyTracker, PoseFrame
+from der_planner.arrays import Array
+from der_planner.bags.reader import BagError, BagReader
+from der_planner.bags.record import header_stamp
+from der_planner.identification.log import LogError, on_grid
+from der_planner.model import CONTROL_PERIOD
+
+LONGEST_SILENCE = 0.25
+"""Time between two messages or frames that a straight line may bridge [s]."""
+_MOTIVE, _QUALISYS = "Format Version", ("NO_OF_FRAMES", "FILE_VERSION")
+"""First words of the tables."""
+_MOTIVE_UNITS = {"Meters": 1.0, "Centimeters": 1e-2, "Millimeters": 1e-3}
+_LARGEST_ARRAY = 64
+"""Longer arrays in bags are pictures and the like."""
+
+
+@dataclass(frozen=True)
+class PoseLog:
+    """Recorded poses of rigid bodies.
+
+    Attributes:
+        names: of the n bodies.
+        time: (K,) [s].
+        positions: (K, n, 3) [m]; NaN where a body was lost.
+        quaternions: (K, n, 4) x, y, z, w.
+    """
+
+    names: tuple[str, ...]
+    time: Array
+    positions: Array
+    quaternions: Array
+
+
+def is_bag(path: Path) -> bool:
+    """Tell whether a path is that of a bag."""
+    return path.is_dir() or path.suffix in (".mcap", ".db3")
+
+
+def read_poses(path: Path) -> PoseLog:
+    """Read rigid bodies from a table of OptiTrack Motive (CSV) or Qualisys QTM (TSV, 6D).
+
+    Raises:
+        LogError: it is neither, or holds no rigid bodies with rotations; says how to export them.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
+    except OSError as error:
+        raise LogError(f"cannot read the poses {path}: {error.strerror}") from error
+    start = lines[0] if lines else ""
+    try:
+        if start.startswith(_MOTIVE):
+            return _motive(path, lines)
+        if start.startswith(_QUALISYS):
+            return _qualisys(path, lines)
+    except (ValueError, IndexError, KeyError, StopIteration) as error:
+        raise LogError(f"the table {path} is not as its program writes it: {error}") from error
+    raise LogError(
+        f"{path} is no table of motion capture that is known: export it from Motive as CSV, or "
+        "from QTM as TSV of 6DOF data, each with its header"
+    )
+
+
+def _motive(path: Path, lines: Sequence[str]) -> PoseLog:
+    first = next(k for k, line in enumerate(lines) if line.startswith("Frame,"))
+    rows = list(csv.reader(lines[: first + 1]))
+    about = dict(zip(rows[0][::2], rows[0][1::2], strict=False))
+    unit = _MOTIVE_UNITS.get(about.get("Length Units", "Meters"))
+    if unit is None or about.get("Rotation Type", "Quaternion") != "Quaternion":
+        raise LogError(
+            f"{path}: lengths in {about.get('Length Units')}, rotations as "
+            f"{about.get('Rotation Type')}: export meters or millimeters, and quaternions"
+        )
+    header = {row[1]: row for row in rows[1:] if len(row) > 1}
+    columns = {
+        head: k
+        for k, head in enumerate(zip(header["Type"], header["Name"], *rows[-2:], strict=False))
+    }
+    names = tuple(name for kind, name, part, axis in columns if (kind, part, axis) == _BODY)
+    if not names:
+        raise LogError(f"{path} holds no rigid bodies: export them from Motive, not markers alone")
+    table = np.genfromtxt(lines[first + 1 :], delimiter=",")
+    places, turns = (
+        [[columns["Rigid Body", name, part, axis] for axis in axes] for name in names]
+        for part, axes in (("Position", "XYZ"), ("Rotation", "XYZW"))
+    )
+    return PoseLog(names, table[:, 1], unit * table[:, places], table[:, turns])
+
+
+_BODY = ("Rigid Body", "Rotation", "W")
+"""Each rigid body of Motive has one such column."""
+
+
+def _qualisys(path: Path, lines: Sequence[str]) -> PoseLog:
+    first = next(k for k, line in enumerate(lines) if "Rot[0]" in line or k == len(lines) - 1)
+    about = {word: rest for word, *rest in (line.split("\t") for line in lines[:first])}
+    names = tuple(name for name in about.get("BODY_NAMES", []) if name)
+    heads = lines[first].split("\t")
+    # x, y, z [mm], three angles and the residual stand before the matrix.
+    starts = np.array([k - 7 for k, head in enumerate(heads) if head == "Rot[0]"], dtype=np.int64)
+    if not names or len(starts) != len(names):
+        raise LogError(f"{path} holds no rigid bodies: export 6DOF data from QTM, with its header")
+    table = np.genfromtxt(lines[first + 1 :], delimiter="\t")
+    time = np.arange(len(table)) / float(about["FREQUENCY"][0])
+    if "Time" in heads:
+        time = table[:, heads.index("Time")]
+    positions = 1e-3 * table[:, starts[:, None] + np.arange(3)]
+    # The nine numbers go down the columns of the matrix; a body that is lost is all zeros.
+    matrices = table[:, starts[:, None] + np.arange(7, 16)].reshape(*positions.shape, 3)
+    lost = ~(np.abs(np.linalg.det(matrices) - 1.0) < 0.1)
+    matrices[lost], positions[lost] = np.eye(3), np.nan
+    quaternions = Rotation.from_matrix(matrices.swapaxes(-1, -2).reshape(-1, 3, 3)).as_quat()
+    return PoseLog(names, time, positions, quaternions.reshape(*lost.shape, 4))
+
+
+def bends_of(log: PoseLog, body_map: Path, time: Array) -> tuple[Array, Array]:
+    """Return bend angles (L, M) [rad] and tips (L, 2) [m] at times (L,) [s]; NaN where not told.
+
+    Raises:
+        LogError: the map cannot be read, names a body that the log has not, or the limb was never
+            seen; says why.
+    """
+    try:
+        bodies = BodyMap.from_yaml(body_map)
+    except BodyMapError as error:
+        raise LogError(str(error)) from error
+    missing = [name for name in bodies.names if name not in log.names]
+    if missing:
+        raise LogError(f"the poses have no body '{missing[0]}': theirs are {', '.join(log.names)}")
+    order = [log.names.index(name) for name in bodies.names]
+    tracker, reason = BodyTracker(bodies), "the log is empty"
+    angles = np.full((len(log.time), len(bodies.segment_lengths)), np.nan)
+    tips = np.full((len(log.time), 2), np.nan)
+    for k, instant in enumerate(log.time):
+        positions = log.positions[k, order] / bodies.unit
+        frame = PoseFrame(round(1e9 * instant), positions, log.quaternions[k, order])
+        followed = tracker.observe(frame).followed
+        if followed.estimate is None:
+            reason = followed.reason
+        elif not followed.bridged:
+            angles[k], tips[k] = followed.estimate.bend_angle, followed.estimate.tip
+    if np.isnan(tips).all():
+        raise LogError(f"no frame of the poses shows the limb: {reason}")
+    return (
+        on_grid(log.time, angles, time, LONGEST_SILENCE),
+        on_grid(log.time, tips, time, LONGEST_SILENCE),
+    )
+
+
+def read_bag_table(path: Path) -> dict[str, Array]:
+    """Return what a bag of anybody's says in numbers, by name, on one grid of 50 ms under ``time``.
+
+    A `sensor_msgs/JointState` gives ``TOPIC.JOINT.position`` and so on, an array ``TOPIC[0]``, a
+    `sensor_msgs/FluidPressure` ``TOPIC``.
+
+    Raises:
+        LogError: the bag cannot be read, or holds none of these.
+    """
+    found: dict[str, dict[float, float]] = {}
+    try:
+        with BagReader(path) as bag:
+            for topic, logged, message in bag.messages(list(bag.topics)):
+                header = getattr(message, "header", None)
+                stamp = header_stamp(message) if header is not None else 0
+                for name, value in _values(topic, message).items():
+                    found.setdefault(name, {})[1e-9 * (stamp or logged)] = value
+    except BagError as error:
+        raise LogError(str(error)) from error
+    found = {name: dict(sorted(kept.items())) for name, kept in found.items() if len(kept) > 1}
+    if not found:
+        raise LogError(f"the bag {path} holds no joint states, arrays or fluid pressures")
+    start = max(min(kept) for kept in found.values())
+    end = min(max(kept) for kept in found.values())
+    if end - start < 1.0:
+        raise LogError(f"the topics of {path} do not overlap: do their clocks agree?")
+    grid = np.arange(start, end, CONTROL_PERIOD)
+    table = {"time": grid - start}
+    for name, kept in found.items():
+        column = np.array(list(kept.values()))[:, None]
+        table[name] = on_grid(np.array(list(kept)), column, grid, LONGEST_SILENCE)[:, 0]
+    return table
+
+
+def _values(topic: str, message: Any) -> dict[str, float]:
+    """Return the numbers of one message by name."""
+    if hasattr(message, "effort"):
+        return {
+            f"{topic}.{name}.{kind}": float(value)
+            for kind in ("position", "velocity", "effort")
+            for name, value in zip(message.name, getattr(message, kind), strict=False)
+        }
+    if hasattr(message, "fluid_pressure"):
+        return {topic: float(message.fluid_pressure)}
+    data = getattr(message, "data", None)
+    if isinstance(data, np.ndarray) and data.dtype.kind in "fi" and data.size <= _LARGEST_ARRAY:
+        return {f"{topic}[{k}]": float(value) for k, value in enumerate(data)}
+    return {}
+
+
+QUESTIONS = {
+    "time": "column of the time",
+    "time_unit": "unit of the time: s, ms or us",
+    "commanded": "columns of the commands: one a segment, or two, left chamber first",
+    "chambers": "columns of the measured chamber pressures, left and right of each segment",
+    "pressure_unit": "unit of the pressures: Pa, hPa, mbar, kPa, bar or psi",
+    "poses": "file of motion capture (CSV of Motive, TSV of QTM); empty: none",
+    "bodies": "body map of it: which body sits where",
+    "poses_late": "what to take off the times of the poses to have those of the table [s]",
+    "angles": "columns of the bend angles, one a segment",
+    "angle_unit": "unit of the angles: rad or deg",
+    "tip": "columns of the tip's x and y in limb_base; empty: none",
+    "length_unit": "unit of the tip: m, cm or mm",
+}
+"""What to ask for each key of a map of columns."""
+_LISTS = ("commanded", "chambers", "angles", "tip")
+_OF_POSES = ("bodies", "poses_late")
+_OF_COLUMNS = ("angles", "angle_unit", "tip", "length_unit")
+
+
+def ask_map(names: Sequence[str], path: Path, ask: Callable[[str], str] = input) -> None:
+    """Ask a person what the columns of a log are, and write the answers down.
+
+    Args:
+        names: of the columns.
+        path: of the map to write.
+        ask: shows a question and returns the answer; columns are answered by number or name.
+
+    Raises:
+        OSError: the map cannot be written.
+    """
+    print("\n".join(f"  {k}: {name}" for k, name in enumerate(names)))
+    content: dict[str, Any] = {}
+    for key, question in QUESTIONS.items():
+        if key in (_OF_COLUMNS if "poses" in content else _OF_POSES):
+            continue
+        words = ask(f"{question}: ").replace(",", " ").split()
+        is_column = key in _LISTS or key == "time"
+        found = [names[int(each)] if is_column and each.isdigit() else each for each in words]
+        if found:
+            content[key] = found if key in _LISTS else found[0]
+    path.write_text(yaml.safe_dump(content, sort_keys=False))

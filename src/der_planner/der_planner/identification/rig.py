@@ -1,0 +1,370 @@
+"""How a rig is put together, found from what moves when one chamber after another is filled.
+
+Each chamber is filled gently, alone and from rest. Which sensor then rises, which segment bends and
+to which side tell the wiring; when they do tells the lags; how far each body moves tells their
+order along the limb.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from der_planner.arrays import Array
+from der_planner.identification.excitation import Excitation
+from der_planner.model import CONTROL_PERIOD
+
+GENTLE = 3000.0
+"""Pressure of the fills [Pa]: a tenth of a right angle on the default limb."""
+REST, HOLD, VENT = 2.0, 3.0, 4.0
+"""Before the first fill, of each fill, and after each [s]."""
+LEVEL = 0.5
+"""Levels are means over so long before something changes [s]."""
+CROSSING = 0.1
+"""A path has begun to answer at this share of its rise."""
+LEAST_RISE = 0.2
+"""Share of the command that a sensor must show to be the one of the chamber."""
+LEAST_BEND = np.deg2rad(1.0)
+"""Bend that counts as one [rad]."""
+CLEAR = 0.5
+"""The second largest answer must be below this share of the largest one."""
+LEAKS, OPEN = 0.1, 0.1
+"""Shortfall of the pressure, and opening of the inlet at steady pressure, that mean a leak."""
+STAYS = 0.15
+"""Share of the rise that is left after `VENT` in a chamber that does not vent."""
+SIDES = {1: "left", -1: "right"}
+"""Names of the chambers of a segment by the sign of its bend."""
+
+
+class RigError(ValueError):
+    """The log of a check cannot be judged; the message says what is missing in it."""
+
+
+@dataclass(frozen=True)
+class RigLog:
+    """What was commanded, measured and seen while one chamber after another was filled.
+
+    Attributes:
+        time: (K,) of commands and sensors [s].
+        command: (K, M) differential pressures [Pa]; above zero the first chamber of a pair is
+            filled, below it the second one.
+        measured: (K, 2M) of the sensors, absolute [Pa].
+        opening: (K, 2M) of the inlet valves, 0 to 1; NaN where the board does not tell.
+        seen_time: (J,) of what was seen [s].
+        places: (J, B, 3) x, y [m] and heading [rad] of tags or bodies; NaN where not seen.
+        names: of the B bodies.
+        arc_lengths: (B,) where the map says that they are [m].
+        segment_lengths: (M,) [m].
+    """
+
+    time: Array
+    command: Array
+    measured: Array
+    opening: Array
+    seen_time: Array
+    places: Array
+    names: tuple[str, ...]
+    arc_lengths: Array
+    segment_lengths: tuple[float, ...]
+
+
+class ValveFinding(NamedTuple):
+    """What the fill of one valve has shown.
+
+    Attributes:
+        valve: counted from 0; with the present wiring it fills chamber ``valve`` of the limb.
+        sensor: that reads it, counted from 0; None if none does.
+        segment: that it bends, counted from 0; None if none does.
+        side: +1 if it bends to the left, counter-clockwise; −1 to the right.
+        rise: of its pressure [Pa].
+        bend: of the segment [rad].
+        sure: 1: only this sensor and this segment answered; 0: others did as much.
+        to_pressure: from the command to the sensor's answer [s].
+        to_motion: from the sensor's answer to that of the limb [s].
+        problems: what is wrong with it.
+    """
+
+    valve: int
+    sensor: int | None
+    segment: int | None
+    side: int
+    rise: float
+    bend: float
+    sure: float
+    to_pressure: float
+    to_motion: float
+    problems: tuple[str, ...]
+
+    @property
+    def chamber(self) -> int | None:
+        """The chamber of the limb that it fills: 0, 1 of segment 0, then of segment 1."""
+        return None if self.segment is None else 2 * self.segment + (self.side < 0)
+
+    def text(self) -> str:
+        """Say it in a line."""
+        moves = "moves nothing"
+        if self.segment is not None:
+            moves = (
+                f"bends segment {self.segment + 1} to the {SIDES[self.side]} by "
+                f"{np.degrees(abs(self.bend)):.1f}°"
+            )
+        reads = "no sensor reads it"
+        if self.sensor is not None:
+            reads = f"sensor {self.sensor + 1} reads {self.rise:.0f} Pa"
+        lags = f"{1e3 * self.to_pressure:.0f} + {1e3 * self.to_motion:.0f} ms"
+        line = f"valve {self.valve + 1}: {moves}, {reads}, {lags}, sure to {100 * self.sure:.0f} %"
+        return "; ".join([line, *self.problems])
+
+
+@dataclass(frozen=True)
+class RigFinding:
+    """How a rig is put together.
+
+    Attributes:
+        valves: (2M,) what each of them does.
+        order: (B,) the bodies by how far along the limb they are, as indices into ``names``.
+        order_ratio: smallest ratio between the ways of neighbours, which tell the order.
+        names: of the bodies.
+        contradictions: why the rig cannot be played as it is; each names the cables to look at.
+        warnings: what does not keep it from being played.
+    """
+
+    valves: tuple[ValveFinding, ...]
+    order: tuple[int, ...]
+    order_ratio: float
+    names: tuple[str, ...]
+    contradictions: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+    @property
+    def wiring(self) -> tuple[int, ...]:
+        """The valve of each chamber of the limb, counted from 0.
+
+        Raises:
+            RigError: the rig contradicts itself.
+        """
+        if self.contradictions:
+            raise RigError("; ".join(self.contradictions))
+        valves = {valve.chamber: valve.valve for valve in self.valves}
+        return tuple(valves[chamber] for chamber in range(len(self.valves)))
+
+    def lines(self) -> list[str]:
+        """Say it in lines, for people and for the rig file."""
+        along = ", ".join(self.names[k] for k in self.order)
+        return [
+            *(valve.text() for valve in self.valves),
+            f"from the clamp to the tip: {along}; each goes {self.order_ratio:.1f} times as far as "
+            "the one before, or farther",
+            *(f"warning: {each}" for each in self.warnings),
+            *(f"refused: {each}" for each in self.contradictions),
+        ]
+
+
+def check_run(segment_count: int = 2, pressure: float = GENTLE) -> Excitation:
+    """Return the pressures of a check: each chamber is filled once, alone, and vented."""
+    held, vented = round(HOLD / CONTROL_PERIOD), round(VENT / CONTROL_PERIOD)
+    rows = [np.zeros((round(REST / CONTROL_PERIOD), segment_count))]
+    for valve in range(2 * segment_count):
+        fill = np.zeros((held + vented, segment_count))
+        fill[:held, valve // 2] = pressure * (1 - 2 * (valve % 2))
+        rows.append(fill)
+    table = np.concatenate(rows)
+    time = CONTROL_PERIOD * np.arange(len(table), dtype=np.float64)
+    return Excitation(time, table)
+
+
+def find_rig(log: RigLog) -> RigFinding:
+    """Find how a rig is put together.
+
+    Raises:
+        RigError: a chamber was not filled in the log, or too little was seen of the limb.
+    """
+    fills = _fills(log)
+    ways = np.array([_change(log.seen_time, log.places, fill)[0] for fill in fills])
+    ways[..., 2] = np.angle(np.exp(1j * ways[..., 2]))
+    blind = np.isnan(ways).any(axis=(0, 2))
+    if blind.all():
+        raise RigError("nothing was seen of the limb: does the tracker see its tags or bodies?")
+    moved = np.sqrt(np.nansum(ways[..., :2] ** 2, axis=(0, 2)))
+    along = sorted((int(k) for k in np.flatnonzero(~blind)), key=lambda k: moved[k])
+    arcs = np.sort(log.arc_lengths[along])
+    ends = _segment_ends(arcs, log.segment_lengths)
+    headings = log.places[:, [along[k] for k in ends], 2]
+    bends = np.diff(headings, axis=1, prepend=0.0)
+    valves = tuple(_judge(log, valve, fill, bends) for valve, fill in enumerate(fills))
+    contradictions, warnings = _compare(valves, len(log.segment_lengths))
+    expected = [int(k) for k in np.argsort(log.arc_lengths) if not blind[k]]
+    if along != expected:
+        wrong = ", ".join(
+            f"{log.names[is_there]} is where the map has {log.names[said]}"
+            for is_there, said in zip(along, expected, strict=True)
+            if is_there != said
+        )
+        contradictions.append(f"the bodies are in another order along the limb: {wrong}")
+    warnings += [f"{log.names[k]} was not seen in every fill" for k in np.flatnonzero(blind)]
+    steps = moved[along[1:]] / np.maximum(moved[along[:-1]], 1e-9)
+    return RigFinding(
+        valves,
+        tuple(along),
+        float(steps.min()) if len(steps) else np.inf,
+        log.names,
+        tuple(contradictions),
+        tuple(warnings),
+    )
+
+
+def _fills(log: RigLog) -> list[tuple[float, float]]:
+    """Return from when to when each chamber was filled [s].
+
+    Raises:
+        RigError: one was not, or two were at once.
+    """
+    filled = np.abs(log.command) > 0.5 * np.abs(log.command).max()
+    if not filled.any() or (filled.sum(axis=1) > 1).any():
+        raise RigError("this is no log of a check: no chamber is filled, or two are at once")
+    found = []
+    for valve in range(2 * log.command.shape[1]):
+        side = log.command[:, valve // 2] * (1 - 2 * (valve % 2)) > 0.0
+        rows = np.flatnonzero(filled[:, valve // 2] & side)
+        if not len(rows):
+            raise RigError(f"valve {valve + 1} was not filled in this log")
+        last = min(rows[-1] + 1, len(log.time) - 1)
+        found.append((float(log.time[rows[0]]), float(log.time[last])))
+    return found
+
+
+def _change(time: Array, values: Array, fill: tuple[float, float]) -> tuple[Array, Array]:
+    """Return how much values change in a fill, and the level from which they do."""
+    start, end = fill
+    before = values[(time >= start - LEVEL) & (time <= start)]
+    after = values[(time > end - LEVEL) & (time <= end)]
+    if not len(before) or not len(after):
+        raise RigError(f"nothing was recorded about the fill at {start:.1f} s")
+    level = _mean(before)
+    return _mean(after) - level, level
+
+
+def _mean(values: Array) -> Array:
+    """Return the mean over the rows that hold numbers; NaN where fewer than half do."""
+    known = np.isfinite(values)
+    count = known.sum(axis=0)
+    total = np.where(known, values, 0.0).sum(axis=0)
+    mean: Array = np.where(2 * count >= len(values), total / np.maximum(count, 1), np.nan)
+    return mean
+
+
+def _crossing(time: Array, values: Array, fill: tuple[float, float]) -> float:
+    """Return when values have made `CROSSING` of their way in a fill [s], NaN if never."""
+    change, level = _change(time, values, fill)
+    rows = np.flatnonzero((time >= fill[0]) & (time <= fill[1]) & np.isfinite(values))
+    share = (values[rows] - level) / change
+    k = int(np.argmax(share >= CROSSING))
+    if share[k] < CROSSING:
+        return float("nan")
+    around = slice(max(k - 1, 0), k + 1)
+    return float(np.interp(CROSSING, share[around], time[rows][around]))
+
+
+def _segment_ends(arcs: Array, lengths: Sequence[float]) -> list[int]:
+    """Return which body, in the order along the limb, tells the heading where a segment ends.
+
+    Raises:
+        RigError: no body is on the second half of a segment.
+    """
+    found = []
+    for index, (end, length) in enumerate(zip(np.cumsum(lengths), lengths, strict=True)):
+        within = np.flatnonzero((arcs <= end + 0.05 * length) & (arcs > end - 0.5 * length))
+        if not len(within):
+            raise RigError(f"no tag or body on the second half of segment {index + 1} was seen")
+        found.append(int(within[-1]))
+    return found
+
+
+def _judge(log: RigLog, valve: int, fill: tuple[float, float], bends: Array) -> ValveFinding:
+    """Judge what the fill of a valve has shown.
+
+    Args:
+        log: of the check.
+        valve: counted from 0.
+        fill: from when to when it was filled [s].
+        bends: (J, M) of the segments [rad].
+    """
+    problems: list[str] = []
+    wanted = float(np.abs(log.command).max())
+    rises, levels = _change(log.time, log.measured, fill)
+    turns, _ = _change(log.seen_time, bends, fill)
+    sensor, rise, sensor_sure = _largest(rises, LEAST_RISE * wanted)
+    segment, bend, bend_sure = _largest(turns, LEAST_BEND)
+    answered, moved = fill[0], float("nan")
+    if sensor is not None:
+        answered = _crossing(log.time, log.measured[:, sensor], fill)
+        short = 1.0 - rise / wanted
+        opening = _mean(log.opening[(log.time > fill[1] - LEVEL) & (log.time <= fill[1])])[valve]
+        if short > LEAKS or opening > OPEN:
+            said = f"it leaks or is fed too little: {100 * short:.0f} % below its command"
+            is_open = f", its inlet {100 * opening:.0f} % open" if np.isfinite(opening) else ""
+            problems.append(said + is_open)
+        later = (log.time > fill[1] + VENT - LEVEL) & (log.time < fill[1] + VENT)
+        left = _mean(log.measured[later])[sensor] - levels[sensor]
+        if left > STAYS * rise:
+            problems.append(f"it does not vent: {left:.0f} Pa are left after {VENT:.0f} s")
+        if sensor_sure < 1.0 - CLEAR:
+            problems.append("more than one sensor rises: is its hose joined to another one?")
+    if segment is not None:
+        moved = _crossing(log.seen_time, bends[:, segment], fill)
+        if bend_sure < 1.0 - CLEAR:
+            problems.append("more than one segment bends: is its hose joined to another one?")
+    if sensor is None and segment is None:
+        problems.append("dead: look at its valve, its supply and its hose at the board")
+    elif segment is None:
+        problems.append("pressure but no motion: its hose ends in no chamber, or is blocked")
+    elif sensor is None:
+        problems.append("motion but no pressure: look at its sensor")
+    sure = max(0.0, min(sensor_sure, bend_sure))
+    lags = (answered - fill[0] if sensor is not None else float("nan"), moved - answered)
+    side = 1 if bend >= 0.0 else -1
+    return ValveFinding(valve, sensor, segment, side, rise, bend, sure, *lags, tuple(problems))
+
+
+def _largest(changes: Array, least: float) -> tuple[int | None, float, float]:
+    """Return which value changed most, by how much, and how clearly; None if none did."""
+    sizes = np.where(np.isfinite(changes), np.abs(changes), 0.0)
+    order = np.argsort(sizes)[::-1]
+    best = int(order[0])
+    if sizes[best] < least:
+        return None, float(changes[best]), 0.0
+    second = sizes[order[1]] if len(order) > 1 else 0.0
+    return best, float(changes[best]), float(1.0 - second / sizes[best])
+
+
+def _compare(valves: Sequence[ValveFinding], count: int) -> tuple[list[str], list[str]]:
+    """Return why valves contradict each other, and what else is worth a warning."""
+    contradictions: list[str] = []
+    warnings: list[str] = []
+    for each in valves:
+        for said in each.problems:
+            grave = each.segment is None or "more than one" in said
+            (contradictions if grave else warnings).append(f"valve {each.valve + 1}: {said}")
+    for chamber in range(2 * count):
+        moved = f"segment {chamber // 2 + 1} to the {SIDES[1 - 2 * (chamber % 2)]}"
+        by = [str(each.valve + 1) for each in valves if each.chamber == chamber]
+        if len(by) > 1:
+            contradictions.append(
+                f"valves {' and '.join(by)} both bend {moved}: the hose of one of them is in the "
+                "wrong port of the limb"
+            )
+        elif not by:
+            contradictions.append(f"no valve bends {moved}")
+    for sensor in range(2 * count):
+        by = [str(each.valve + 1) for each in valves if each.sensor == sensor]
+        if len(by) > 1:
+            contradictions.append(
+                f"sensor {sensor + 1} answers to valves {' and '.join(by)}: look at its cable and "
+                "at the ports of its board"
+            )
+        elif by and by != [str(sensor + 1)]:
+            warnings.append(f"sensor {sensor + 1} reads valve {by[0]}: are their cables swapped?")
+    return contradictions, warnings

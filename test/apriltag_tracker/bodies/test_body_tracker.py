@@ -1,0 +1,202 @@
+"""The limb from rigid bodies of a simulated motion capture system."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from apriltag_tracker.bodies.base import PlaneWatch, fit_frame
+from apriltag_tracker.bodies.body_map import AXES, BodyMap, BodyMapError
+from apriltag_tracker.bodies.tracker import BodyNoise, BodyTracker, FrameAssembler
+from apriltag_tracker.pose.following import FollowerOptions, Uncertainty
+from apriltag_tracker.synthetic.poses import MocapFaults, SyntheticMocap
+
+PERIOD = 1.0 / 120.0
+NOISE = MocapFaults(position_noise=1e-4, direction_noise=3e-3)
+
+
+@pytest.fixture(scope="session")
+def bodies(config) -> BodyMap:
+    found = BodyMap.from_yaml(config / "bodies.yaml")
+    # The limb of these tests has no stiff stretches: its arcs are exact.
+    return dataclasses.replace(found, stiff=())
+
+
+def run(mocap, swing, count, tracker=None):
+    """Return stamps [s], true tips and observations of a swinging limb."""
+    tracker = tracker or BodyTracker(mocap.bodies, noise=BodyNoise(1e-4, 3e-3))
+    times = 10.0 + PERIOD * np.arange(count)
+    shapes = [swing.shape(time) for time in times]
+    found = [
+        tracker.observe(mocap.frame(round(1e9 * time), shape))
+        for time, shape in zip(times, shapes, strict=True)
+    ]
+    return times, np.array([shape.points[-1] for shape in shapes]), found
+
+
+def errors(tips, found):
+    return np.array([each.followed.estimate.tip for each in found]) - tips
+
+
+@pytest.mark.parametrize(("up", "unit"), [("z", 1.0), ("y", 1e-3), ("-x", 1e-2)])
+def test_the_tip_is_found_in_any_frame_and_unit(bodies, swing, up, unit):
+    mapped = dataclasses.replace(bodies, unit=unit, up=tuple(AXES[up]))
+    _, tips, found = run(SyntheticMocap(mapped, tilt=0.1), swing, 10)
+    assert np.abs(errors(tips, found)).max() < 5e-5
+    assert all(not each.followed.reason for each in found)
+
+
+def test_noise_comes_out_as_the_covariance_says(bodies, swing):
+    options = FollowerOptions(uncertainty=Uncertainty(survey=0, mounting=0, mounting_angle=0))
+    tracker = BodyTracker(bodies, options, BodyNoise(1e-4, 3e-3))
+    _, tips, found = run(SyntheticMocap(bodies, NOISE, seed=4), swing, 400, tracker)
+    # The base settles first.
+    gaps, late = errors(tips, found)[100:], found[100:]
+    spreads = [each.followed.estimate.tip_covariance for each in late]
+    ratio = np.mean([gap @ np.linalg.solve(s, gap) for gap, s in zip(gaps, spreads, strict=True)])
+    assert 0.6 < ratio / 2 < 1.5
+    assert np.sqrt(np.mean(np.sum(gaps**2, axis=1))) < 2e-4
+
+
+def test_lost_bodies_are_named_and_the_tip_stays(bodies, swing):
+    faults = dataclasses.replace(NOISE, dropout=0.1)
+    _, tips, found = run(SyntheticMocap(bodies, faults, seed=1), swing, 200)
+    valid = [k for k, each in enumerate(found) if each.followed.estimate is not None]
+    assert len(valid) > 180
+    assert any("without body limb_3" in each.followed.reason for each in found)
+    every = [k for k in valid if len(found[k].followed.estimate.tags_used) == len(bodies.limb)]
+    assert np.abs(errors(tips[every], [found[k] for k in every])).max() < 1e-3
+
+
+def test_a_body_that_stands_still_while_others_move_is_lost(bodies, swing):
+    mocap, tracker = SyntheticMocap(bodies, NOISE), BodyTracker(bodies)
+    frozen = bodies.names.index("limb_4")
+    first = mocap.frame(0, swing.shape(0.0))
+    for k in range(1, 30):
+        frame = mocap.frame(round(k * PERIOD * 1e9), swing.shape(k * PERIOD))
+        frame.positions[frozen], frame.quaternions[frozen] = (
+            first.positions[frozen],
+            first.quaternions[frozen],
+        )
+        seen = tracker.observe(frame)
+    assert np.isnan(seen.places[3]).all()
+    assert "without body limb_4" in seen.followed.reason
+
+
+def test_swapped_names_are_noticed_and_put_right(bodies, swing):
+    faults = dataclasses.replace(NOISE, swapped=("limb_2", "limb_4"), swapped_from=0.5)
+    mocap = SyntheticMocap(bodies, faults)
+    tracker = BodyTracker(bodies, noise=BodyNoise(1e-4, 3e-3))
+    _, tips, found = run(mocap, swing, 120, tracker)
+    assert tracker.swapped == 60
+    assert "each other's names: limb_2, limb_4" in found[-1].followed.reason
+    assert np.abs(errors(tips, found)).max() < 1e-3
+
+
+def test_fixed_bodies_that_do_not_fit_together_are_an_error(bodies, swing):
+    mocap = SyntheticMocap(bodies, NOISE)
+    moved = dataclasses.replace(bodies.fixed[1], position=np.array([0.13, 0.28, 0.0]))
+    wrong = dataclasses.replace(bodies, fixed=(bodies.fixed[0], moved, *bodies.fixed[2:]))
+    tracker = BodyTracker(wrong)
+    seen = tracker.observe(mocap.frame(0, swing.shape(0.0)))
+    assert seen.followed.estimate is None
+    assert "do not fit together" in seen.followed.reason
+
+
+def test_bodies_of_the_table_that_move_together_are_the_mocap_that_was_moved(bodies, swing):
+    tracker = BodyTracker(bodies, noise=BodyNoise(1e-4, 3e-3))
+    run(SyntheticMocap(bodies, NOISE), swing, 20, tracker)
+    _, tips, found = run(SyntheticMocap(bodies, NOISE, turn=0.5), swing, 20, tracker)
+    assert tracker.base.bumps == 1
+    assert np.abs(errors(tips[5:], found[5:])).max() < 1e-3
+
+
+def test_a_frame_is_found_from_points_that_are_not_on_a_line():
+    points = np.random.default_rng(2).normal(size=(4, 3))
+    turned = points @ np.roll(np.eye(3), 1, axis=0) + [1.0, 2.0, 3.0]
+    frame, left = fit_frame(points, turned)
+    assert left < 1e-12
+    assert np.allclose(frame.of(points), turned)
+    assert np.isclose(np.linalg.det(frame.rotation), 1.0)
+    line = np.outer(np.arange(4.0), [1.0, 2.0, 0.5])
+    assert fit_frame(line, line) is None
+
+
+def test_the_plane_of_motion_is_told_with_its_tilt(swing, bodies):
+    watch, tilt = PlaneWatch(2), np.deg2rad(3.0)
+    turn = np.array([[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]])
+    assert watch.normal is None
+    for time in np.arange(0.0, 6.0, 0.05):
+        points = swing.shape(time).points[[60, -1]]
+        watch.take(np.column_stack([points, [0.0, 0.02]]) @ turn.T)
+    assert watch.normal == pytest.approx(turn[:, 2], abs=1e-9)
+    assert watch.values()["plane_tilt_deg"] == "3.00"
+    assert watch.values()["out_of_plane_mm_rms"] == "0.00"
+
+
+def pose(x):
+    return (x, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+
+
+@pytest.fixture
+def assembler(bodies):
+    return FrameAssembler(dataclasses.replace(bodies, names=("a", "b", "c")))
+
+
+def stamps_of(assembler, *come):
+    """Take bodies, each as "name stamp in ms"; return the stamps of the frames that they end."""
+    told = []
+    for name, stamp in (each.split() for each in come):
+        frames = assembler.take(name, round(1e6 * float(stamp)), pose(float(stamp)))
+        told.append([round(frame.stamp * 1e-6) for frame in frames])
+    return told
+
+
+def test_poses_that_come_one_by_one_become_frames(assembler):
+    assert stamps_of(assembler, "a 0", "b 0") == [[], []]
+    (frame,) = assembler.take("c", 400_000, pose(3.0))
+    assert frame.stamp == 0
+    assert frame.positions[:, 0].tolist() == [0.0, 0.0, 3.0]
+    assert stamps_of(assembler, "stranger 10") == [[]]
+    assert assembler.unknown == {"stranger": 1}
+
+
+def test_bodies_may_be_a_frame_behind_each_other(assembler):
+    told = stamps_of(assembler, "a 0", "a 10", "b 0", "c 0", "b 10", "a 20", "c 10", "b 20", "c 20")
+    assert told == [[], [], [], [0], [], [], [10], [], [20]]
+
+
+def test_a_body_that_is_lost_holds_up_frames_and_comes_back(assembler):
+    # One that misses a frame is known to do so as soon as the next frame is whole.
+    told = stamps_of(assembler, "a 0", "b 0", "a 10", "b 10", "c 10")
+    assert told[-1] == [0, 10]
+    # One that is gone is waited for until two more frames have begun.
+    told = stamps_of(assembler, "a 20", "b 20", "a 30", "b 30", "a 40", "b 40", "a 50", "b 50")
+    assert told == [[], [], [], [], [20], [30, 40], [], [50]]
+    told = stamps_of(assembler, "c 50", "a 60", "b 60", "c 60")
+    assert told == [[], [], [], [60]]
+
+
+def test_a_clock_that_was_set_back_begins_anew(assembler):
+    assert stamps_of(assembler, "a 5000", "b 5000", "c 5000")[-1] == [5000]
+    assert stamps_of(assembler, "a 1000", "b 1000", "c 1000")[-1] == [1000]
+
+
+def test_wrong_maps_are_named(bodies):
+    limb = {"segment_lengths": [0.122, 0.122]}
+    on_limb = {"name": "a", "arc_length": 0.1}
+    for change, said in (
+        ({"schema": 2}, "schema: 1"),
+        ({"length_unit": "inch"}, "length_unit is 'inch': choose m, cm, mm"),
+        ({"up": "w"}, "up is 'w'"),
+        ({"bodies": [on_limb, on_limb]}, "listed twice"),
+        ({"bodies": [{**on_limb, "arc_length": 0.3}]}, "not on the limb"),
+        ({"bodies": [{"name": "a"}]}, "place: clamp"),
+        ({"bodies": [{**on_limb, "colour": 1}]}, "unknown key 'colour'"),
+        ({"bodies": [{**on_limb, "rotation": [0, 0, 0, 2]}]}, "no quaternion"),
+        ({"bodies": [{"name": "a", "place": "world", "position": [0, 0, 0]}]}, "arc_length"),
+    ):
+        with pytest.raises(BodyMapError, match=said):
+            BodyMap.from_dict({"schema": 1, "limb": limb, "bodies": [on_limb], **change})

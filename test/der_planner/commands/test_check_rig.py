@@ -1,0 +1,40 @@
+"""From what a check has found to the driver's wiring."""
+
+from __future__ import annotations
+
+import pytest
+
+from der_planner.commands.check_rig import played_wiring
+from der_planner.identification.rig import RigError, RigFinding, ValveFinding
+from pressure_driver.hoses import HoseError
+
+
+def found(*moves: tuple[int, int], contradictions: tuple[str, ...] = ()) -> RigFinding:
+    """Return what a check finds whose valves bend these segments to these sides."""
+    valves = tuple(
+        ValveFinding(valve, valve, segment, side, 3000.0, 0.1 * side, 1.0, 0.05, 0.05, ())
+        for valve, (segment, side) in enumerate(moves)
+    )
+    return RigFinding(valves, (0, 1), 2.0, ("a", "b"), contradictions, ())
+
+
+@pytest.mark.parametrize(
+    ("moves", "before", "wiring"),
+    [
+        (((0, 1), (0, -1), (1, 1), (1, -1)), "", "1,2,3,4"),
+        (((0, -1), (0, 1), (1, 1), (1, -1)), "", "2,1,3,4"),
+        (((1, -1), (1, 1), (0, 1), (0, -1)), "", "3,4,2,1"),
+        # A check that was played with a wiring finds what is left to change.
+        (((0, 1), (0, -1), (1, 1), (1, -1)), "3,4,2,1", "3,4,2,1"),
+        (((0, -1), (0, 1), (1, 1), (1, -1)), "3,4,2,1", "4,3,2,1"),
+    ],
+)
+def test_the_driver_gets_the_valve_of_each_chamber(moves, before, wiring):
+    assert played_wiring(found(*moves), before) == wiring
+
+
+def test_what_cannot_be_played_is_refused():
+    with pytest.raises(HoseError, match="swap the hoses"):
+        played_wiring(found((0, 1), (1, 1), (0, -1), (1, -1)), "")
+    with pytest.raises(RigError, match="wrong port"):
+        played_wiring(found((0, 1), (0, 1), (1, 1), (1, -1), contradictions=("wrong port",)), "")
