@@ -281,6 +281,7 @@ class PlannerNode(Node):
                 result = plan(
                     request.limb, request.motion, request.model, request.method,
                     nodes=self._options.nodes, start=start, progress=progress,
+                    obstacles=self._options.obstacles,
                 )  # fmt: skip
             elif start is not None:
                 raise ValueError("a learned plan begins at rest: send it after this motion")

@@ -25,7 +25,7 @@ from der_planner.control.feedback import Feedback
 from der_planner.control.reaction import KINDS, Kind
 from der_planner.limb import HEAVIEST, Limb
 from der_planner.methods import LEARNED
-from der_planner.planning import METHODS, Motion, PathLimits, choose_method
+from der_planner.planning import METHODS, Motion, Obstacles, PathLimits, choose_method
 from der_planner.planning.motions import DEFAULT_AMPLITUDE, DEFAULT_CYCLES, DEFAULT_PERIOD
 from der_planner.planning.plan_file import Plan, learned_plan
 from der_planner.planning.streaming import GRID, Schedule
@@ -64,6 +64,7 @@ class PlannerOptions:
     feedback: bool
     reaction: Kind
     force_limit: float
+    obstacles: Obstacles | None
 
     def corrected(self, planned: Plan) -> Feedback:
         """Return feedback on a plan, with the reaction to a touch that is set."""
@@ -82,6 +83,7 @@ def read_parameters(node: Node) -> PlannerOptions:
     Raises:
         ParameterError: a value is out of range; names it.
         LimbError: the limb file cannot be used.
+        PlanningError: the file of obstacles cannot be used.
     """
     read: Any = functools.partial(declare, node)
     limb_file = read("limb_file", "", "limb file (YAML); empty: the default limb")
@@ -89,6 +91,10 @@ def read_parameters(node: Node) -> PlannerOptions:
     mounting = read(
         "mounting", "", "horizontal, hanging, standing, sideways or degrees of tilt; empty: "
         "gravity as in the limb file"
+    )  # fmt: skip
+    in_the_way = read(
+        "obstacles", "", "file (YAML) of what is in the limb's way: a motion that would run into "
+        "it is refused; empty: nothing"
     )  # fmt: skip
     learned_plans = read(
         "learned_plans", "", "folder of learned plans: a command of the method 'learned' names one "
@@ -152,6 +158,7 @@ def read_parameters(node: Node) -> PlannerOptions:
             "force_limit", 0.0, "force [N] that the reaction 'yield' allows; 0: none more than "
             "there is when the touch is noticed", at_least=0.0, at_most=100.0
         ),
+        obstacles=Obstacles.from_yaml(in_the_way) if in_the_way else None,
     )  # fmt: skip
 
 
