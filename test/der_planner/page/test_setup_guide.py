@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import pytest
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
 from der_msgs.msg import LimbState, PressureState
@@ -53,9 +54,9 @@ def test_a_running_rig_passes_until_it_falls_silent() -> None:
     rig.drive(VENTED)
     rig.situation.put_limb(LimbState(valid=True))
     rig.plan_for("a name", "2026-02-01, bags/run")
-    assert rig.done() == [True, True, False, True, True, True, True, True]
+    assert rig.done() == [True, True, False, True, True, True, False, True, True]
     rig.now = 6.0
-    assert rig.done() == [False, False, False, True, True, False, False, False]
+    assert rig.done() == [False, False, False, True, True, False, False, False, False]
 
 
 def test_each_chamber_counts_only_if_it_is_driven_alone() -> None:
@@ -78,17 +79,26 @@ def test_pressure_that_stays_and_a_limb_that_nobody_identified_are_no_success() 
     steps = rig.steps()
     assert not steps[1].done
     assert "1.50 kPa" in steps[1].seen
-    assert not steps[6].done
     assert not steps[7].done
+    assert not steps[8].done
     rig.drive(VENTED, mode=1)
     assert not rig.steps()[1].done
     rig.drive(VENTED, telemetry_age=float("nan"))
     assert "never been heard" in rig.steps()[0].seen
 
 
-def test_a_calibration_run_is_seen_while_and_after_it_is_played() -> None:
+@pytest.mark.parametrize(("plan", "step"), [("check-12ab", 6), ("calibration-12ab34cd", 7)])
+def test_a_run_is_seen_while_and_after_it_is_played(plan: str, step: int) -> None:
     rig = GuidedSetup()
-    rig.drive(VENTED, mode=2, plan_id="calibration-12ab34cd")
-    assert (rig.steps()[6].done, rig.steps()[6].seen) == (False, "one is being played")
+    rig.drive(VENTED, mode=2, plan_id=plan)
+    assert (rig.steps()[step].done, rig.steps()[step].seen) == (False, "one is being played")
     rig.drive(VENTED)
-    assert rig.steps()[6].done
+    assert rig.steps()[step].done
+
+
+def test_with_motion_capture_no_camera_is_asked_for() -> None:
+    rig = GuidedSetup()
+    rig.situation.put_status(DiagnosticStatus(name="/limb/pose_tracker"))
+    steps = rig.steps("no calibration yet", calibrated=False)
+    assert [step.done for step in steps[3:6]] == [True, True, False]
+    assert "motion capture" in steps[3].seen

@@ -61,20 +61,21 @@ class BaseFinder:
         axes = [np.eye(3) if body.rotation is None else body.rotation for body in bodies.fixed]
         places = np.array([body.position for body in bodies.fixed]).reshape(-1, 3)
         self._places = _arms(places, np.array(axes).reshape(-1, 3, 3))
-        self._fixed = bodies.frame
+        self._fixed, self._bodies = bodies.frame, bodies
         self._mean, self._seen = np.zeros_like(self._places), np.zeros(len(self._index))
         self._shifted = 0
         self.frame = bodies.frame
         self.residual = math.nan
         """RMS distance of the fixed bodies from where the map has them [m]."""
         self.bumps = 0
+        self.guessed = False
+        """Whether the frame is a guess from the limb's first shape."""
         self.problem = ""
         if bodies.frame is None:
             self.problem = (
                 "no fixed body has been seen yet"
                 if self._index
-                else "the body map has neither fixed bodies nor a frame: add 'place: clamp' or "
-                "'place: world'"
+                else "the map has neither fixed bodies nor a frame, and the limb has not been seen"
             )
 
     def update(self, positions: Array, rotations: Array) -> BaseFrame | None:
@@ -84,6 +85,8 @@ class BaseFinder:
             positions: (n, 3) m, in the order of the map's names; NaN for what was not seen.
             rotations: (n, 3, 3) the bodies' axes, as columns.
         """
+        if self.frame is None and not self._index:
+            self._guess(positions)
         points = _arms(positions[self._index], rotations[self._index])
         seen = np.isfinite(points[:, 0, 0])
         if self._fixed is not None or not seen.any():
@@ -117,6 +120,21 @@ class BaseFinder:
             (self.frame, self.residual), self.problem = found, ""
         return self.frame
 
+    def _guess(self, positions: Array) -> None:
+        """Take the frame from the limb's first shape, as if it were straight."""
+        limb = sorted(self._bodies.limb, key=lambda body: body.arc_length)
+        first, last = (positions[self._bodies.names.index(limb[k].name)] for k in (0, -1))
+        up = np.array(self._bodies.up)
+        along = last - first - up * (up @ (last - first))
+        length = np.linalg.norm(along)
+        if not length > _LEAST_SPREAD:
+            return
+        rotation = np.array([along / length, np.cross(up, along / length), up])
+        start = limb[0]
+        place = np.array([start.arc_length + start.offset[0], start.offset[1], start.height])
+        self.frame, self.guessed = BaseFrame(rotation, place - rotation @ first), True
+        self.problem = ""
+
 
 def _arms(positions: Array, rotations: Array) -> Array:
     """Return the origins of bodies and the ends of their axes, (n, 4, 3)."""
@@ -125,49 +143,36 @@ def _arms(positions: Array, rotations: Array) -> Array:
 
 
 class PlaneWatch:
-    """Finds the plane in which the bodies of a limb move, without keeping their ways.
+    """Finds the plane in which a limb moves, from where its bodies were so far.
 
     Args:
-        count: of the bodies.
+        heights: (n,) of the bodies above the centreline's plane, as the map says [m].
     """
 
-    def __init__(self, count: int) -> None:
-        self._frames = np.zeros(count)
-        self._mean = np.zeros((count, 3))
-        self._scatter = np.zeros((3, 3))
-        self._furthest = 0.0
+    def __init__(self, heights: Array) -> None:
+        self._heights = heights
+        self._count = 0
+        self._sum, self._squares = np.zeros(3), np.zeros((3, 3))
 
     def take(self, places: Array) -> None:
-        """Take the places (count, 3) [m] of one frame; NaN for what was not seen."""
+        """Take the places (n, 3) [m] of one frame; NaN for what was not seen."""
         seen = np.isfinite(places).all(axis=1)
-        self._frames[seen] += 1.0
-        off = places[seen] - self._mean[seen]
-        self._mean[seen] += off / self._frames[seen, None]
-        self._scatter += off.T @ (places[seen] - self._mean[seen])
-        if seen.any():
-            self._furthest = max(self._furthest, float(np.abs(off[:, 2]).max()))
-
-    @property
-    def normal(self) -> Array | None:
-        """(3,) unit vector across the plane, z up; None before the limb has moved enough."""
-        total = self._frames.sum()
-        if total < 2:
-            return None
-        values, vectors = np.linalg.eigh(self._scatter / total)
-        if math.sqrt(max(values[1], 0.0)) < max(_LEAST_MOTION, 3.0 * math.sqrt(max(values[0], 0))):
-            return None
-        normal = np.asarray(vectors[:, 0], dtype=np.float64)
-        return normal if normal[2] >= 0.0 else -normal
+        points = places[seen] - self._heights[seen, None] * [0.0, 0.0, 1.0]
+        self._count += len(points)
+        self._sum += points.sum(axis=0)
+        self._squares += points.T @ points
 
     def values(self) -> dict[str, object]:
         """Return what to tell of it: its tilt against `limb_base`, how far bodies leave it."""
-        normal = self.normal
-        if normal is None:
+        mean = self._sum / max(self._count, 1)
+        spread = self._squares / max(self._count, 1) - np.outer(mean, mean)
+        squares, axes = np.linalg.eigh(spread)
+        out, across = np.sqrt(np.maximum(squares[:2], 0.0))
+        if across < max(_LEAST_MOTION, 3.0 * out):
             return {"plane": "the limb has not moved enough to show its plane"}
-        out = math.sqrt(max(float(normal @ self._scatter @ normal), 0.0) / self._frames.sum())
+        normal = axes[:, 0] * np.copysign(1.0, axes[2, 0])
         return {
             "plane_tilt_deg": f"{math.degrees(math.acos(min(1.0, normal[2]))):.2f}",
             "plane_tilt_toward_deg": f"{math.degrees(math.atan2(normal[1], normal[0])):.0f}",
             "out_of_plane_mm_rms": f"{1e3 * out:.2f}",
-            "height_mm_largest_change": f"{1e3 * self._furthest:.2f}",
         }

@@ -76,6 +76,27 @@ class BaseFrame:
         """Return points (n, 3) of the poses' frame [m] in `limb_base`."""
         return np.asarray(points @ self.rotation.T + self.translation, dtype=np.float64)
 
+    def moved(self, origin: NDArray[np.float64], axes: NDArray[np.float64]) -> BaseFrame:
+        """Return the frame whose origin and axes, as columns, are these in this one."""
+        return BaseFrame(axes.T @ self.rotation, axes.T @ (self.translation - origin))
+
+    def as_mapping(self) -> dict[str, list[float]]:
+        """Return it as the key `frame` of a body map."""
+        turn = Rotation.from_matrix(self.rotation.T).as_quat(canonical=True)
+        origin = -self.rotation.T @ self.translation
+        return {"position": origin.round(5).tolist(), "rotation": turn.round(6).tolist()}
+
+    @classmethod
+    def from_mapping(cls, entry: dict[str, Any]) -> BaseFrame:
+        """Read where the origin and the axes of `limb_base` are in the frame of the poses, in m.
+
+        Raises:
+            BodyMapError, TagMapError: a key is missing or impossible.
+        """
+        origin = np.array(floats(entry.get("position"), 3, "frame: position"))
+        rotation = _rotation(entry.get("rotation"), "frame").T
+        return cls(rotation, -rotation @ origin)
+
 
 @dataclass(frozen=True)
 class BodyMap:
@@ -157,7 +178,7 @@ class BodyMap:
             stiff=stiff,
             unit=LENGTH_UNITS[unit],
             up=tuple(AXES[up].tolist()),
-            frame=None if frame is None else _frame(section(data, "frame")),
+            frame=None if frame is None else BaseFrame.from_mapping(section(data, "frame")),
         )
 
 
@@ -187,10 +208,3 @@ def _rotation(value: Any, name: str) -> NDArray[np.float64]:
     if not 0.99 < float(np.linalg.norm(quaternion)) < 1.01:
         raise BodyMapError(f"{name}: rotation {value} is no quaternion x, y, z, w of length 1")
     return np.asarray(Rotation.from_quat(quaternion).as_matrix(), dtype=np.float64)
-
-
-def _frame(entry: dict[str, Any]) -> BaseFrame:
-    """Read where the origin and the axes of `limb_base` are in the frame of the poses, in m."""
-    origin = np.array(floats(entry.get("position"), 3, "frame: position"))
-    rotation = _rotation(entry.get("rotation"), "frame").T
-    return BaseFrame(rotation, -rotation @ origin)

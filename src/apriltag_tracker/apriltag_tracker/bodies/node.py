@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import json
 import sys
 import time
 from typing import Any
@@ -104,6 +105,8 @@ class PoseTrackerNode(LimbStateNode):
             "base_bumps": tracker.base.bumps,
             **tracker.plane.values(),
         }
+        if tracker.base.frame is not None:
+            values["frame"] = json.dumps(tracker.base.frame.as_mapping())
         if silence := self._watch.silence():
             others = f"; other bodies came: {', '.join(unknown)}" if unknown else ""
             why = "are its poses of the bodies of the body map?"
@@ -115,6 +118,9 @@ class PoseTrackerNode(LimbStateNode):
             return Health("error", error, values)
         if tracker.base.bumps:
             said = f"fixed bodies were moved {tracker.base.bumps} time(s); the base was found again"
+            return Health("warning", said, values)
+        if tracker.base.guessed:
+            said = "limb_base is a guess from the first shape: scripts/check_rig.py finds it"
             return Health("warning", said, values)
         if self._reason:
             return Health("warning", self._reason, values)

@@ -141,7 +141,7 @@ class BodyTracker:
         noise = noise or BodyNoise()
         self._covariance = np.diag([noise.position, noise.position, noise.direction]) ** 2
         self.base = BaseFinder(bodies)
-        self.plane = PlaneWatch(len(bodies.limb))
+        self.plane = PlaneWatch(np.array([body.height for body in bodies.limb]))
         names = {place: body.name for place, body in enumerate(bodies.limb)}
         self.follower = LimbFollower(bodies, names, self._options, "body", "in the poses")
         self._index = [bodies.names.index(body.name) for body in bodies.limb]

@@ -15,12 +15,13 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import yaml
 
-from apriltag_tracker.bodies.body_map import BodyMap, BodyMapError
+from apriltag_tracker.bodies.body_map import BaseFrame, BodyMap, BodyMapError
 from apriltag_tracker.pose.clamp import Clamp, find_clamp
 from apriltag_tracker.tag_map import LimbTag, TagMap, TagMapError
 from der_planner.bags.reader import BagError, BagReader
@@ -40,6 +41,7 @@ from der_planner.identification.rig import GENTLE, RigError, RigFinding, RigLog,
 from der_planner.limb import Limb
 from der_planner.twin import TwinError
 from der_planner.twin.wiring import Wiring
+from limb_interfaces import topics
 from pressure_driver.hoses import HoseError, Hoses
 from pressure_driver.settings import Settings
 
@@ -93,8 +95,18 @@ def _main(given: argparse.Namespace) -> int:
     lines = finding.lines()
     offsets = [body.offset for body in bodies.limb]
     clamp = find_clamp(bodies, log.arc_lengths, offsets, log.places)
+    told = _tracker_values(bag) if isinstance(bodies, BodyMap) else {}
+    if "plane_tilt_deg" in told:
+        lines.append(
+            f"plane of motion: tilted by {told['plane_tilt_deg']}° toward "
+            f"{told['plane_tilt_toward_deg']}°, bodies leave it by {told['out_of_plane_mm_rms']} mm"
+        )
+    frame = None
     if clamp is not None and not finding.contradictions:
         lines += clamp_lines(clamp)
+        if isinstance(bodies, BodyMap) and not bodies.fixed and "frame" in told:
+            frame = found_frame(clamp, told)
+            lines.append("limb_base: found from the limb, for a map without fixed bodies")
     print("\n".join(lines))
     driver = dict(hardware.driver) if hardware else {}
     try:
@@ -106,9 +118,47 @@ def _main(given: argparse.Namespace) -> int:
         content = yaml.safe_load(given.hardware.read_text()) if given.hardware else {}
         content |= {"driver": driver, "found": lines}
         given.out.parent.mkdir(parents=True, exist_ok=True)
+        if frame is not None and hardware is not None and hardware.poses is not None:
+            mapped = yaml.safe_load(Path(hardware.poses["body_map"]).read_text())
+            path = given.out.with_name(f"{given.out.stem}_bodies.yaml").resolve()
+            path.write_text(yaml.safe_dump(mapped | {"frame": frame}, sort_keys=False))
+            content["poses"] = {**hardware.poses, "body_map": str(path)}
+            print(f"body map: {path}")
         given.out.write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True))
         print(f"rig file: {given.out}")
     return 0
+
+
+def found_frame(clamp: Clamp, told: Mapping[str, str]) -> dict[str, list[float]]:
+    """Return the key `frame` of a body map: at the clamp, with z across the plane of motion.
+
+    Args:
+        clamp: found in the frame that the tracker of bodies had.
+        told: its diagnostics: that frame, and the plane's tilt.
+    """
+    tilt, toward = (
+        float(np.radians(float(told.get(key, 0.0))))
+        for key in ("plane_tilt_deg", "plane_tilt_toward_deg")
+    )
+    x, y, heading = clamp.place
+    up = np.array([np.sin(tilt) * np.cos(toward), np.sin(tilt) * np.sin(toward), np.cos(tilt)])
+    along = np.array([np.cos(heading), np.sin(heading), 0.0])
+    along -= up * (up @ along)
+    along /= np.linalg.norm(along)
+    axes = np.column_stack([along, np.cross(up, along), up])
+    before = BaseFrame.from_mapping(yaml.safe_load(told["frame"]))
+    return before.moved(np.array([x, y, 0.0]), axes).as_mapping()
+
+
+def _tracker_values(bag: Path) -> dict[str, str]:
+    """Return the last diagnostics of the tracker of bodies."""
+    found: dict[str, str] = {}
+    with BagReader(bag) as reader:
+        for _, _, message in reader.messages([topics.DIAGNOSTICS]):
+            for status in message.status:
+                if status.name.endswith("pose_tracker"):
+                    found = {entry.key: entry.value for entry in status.values}
+    return found
 
 
 def clamp_lines(clamp: Clamp) -> list[str]:

@@ -207,7 +207,7 @@ def play_calibration(
     stage = f"the hardware at {hardware.place}" if hardware else f"the twin of seed {seed}"
     progress.say(f"playing {excitation.duration:.0f} s on {stage}, into {folder}")
     metadata = {
-        "motion": "calibration",
+        "motion": excitation.name,
         "stage": stage,
         "seed": None if hardware else seed,
         "largest_pressure_Pa": float(np.abs(excitation.differential_pressure).max()),
@@ -223,7 +223,7 @@ def play_calibration(
         wiring=wiring,
     )
     # The driver refuses a plan that it has heard before an arming: each run has its own.
-    plan_id = f"calibration-{uuid.uuid4().hex[:8]}"
+    plan_id = f"{excitation.name}-{uuid.uuid4().hex[:8]}"
     sent = 0
     with GraphClient() as client:
         publisher = client.node.create_publisher(

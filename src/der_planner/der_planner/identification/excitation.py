@@ -37,10 +37,12 @@ class Excitation:
     Attributes:
         time: (K,) [s].
         differential_pressure: (K, M) [Pa].
+        name: of what it is for; the plan's id begins with it.
     """
 
     time: Array
     differential_pressure: Array
+    name: str = "calibration"
 
     @property
     def duration(self) -> float:

@@ -173,7 +173,7 @@ def check_run(segment_count: int = 2, pressure: float = GENTLE) -> Excitation:
         rows.append(fill)
     table = np.concatenate(rows)
     time = CONTROL_PERIOD * np.arange(len(table), dtype=np.float64)
-    return Excitation(time, table)
+    return Excitation(time, table, "check")
 
 
 def find_rig(log: RigLog) -> RigFinding:

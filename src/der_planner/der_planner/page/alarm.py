@@ -13,16 +13,19 @@ NODES = {
     "pressure_driver": "nothing watches the pressures of the limb",
     "planner": "no motion can be asked for",
     "apriltag_tracker": "the limb is not tracked",
+    "pose_tracker": "the limb is not tracked",
     "recorder": "nothing is recorded",
     "page": "",
     "experiment": "the experiment has stopped",
     "board_emulator": "the twin's valve board stands still",
     "limb_twin": "the twin stands still",
     "synthetic_camera": "the twin's camera stands still",
+    "synthetic_poses": "the twin's motion capture stands still",
 }
 """Nodes of a limb, worst first, with what their end means."""
 DRIVER = "pressure_driver"
-WANTED = (DRIVER, "planner", "apriltag_tracker", "recorder")
+TRACKERS = ("apriltag_tracker", "pose_tracker")
+WANTED = (DRIVER, "planner", TRACKERS[0], "recorder")
 """Without these a limb is not played, seen and recorded."""
 ORDER = ("dead", "error", "late", "warning", "stale", "ok", "ended")
 """States of nodes, worst first."""
@@ -59,6 +62,7 @@ def worst_first(nodes: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 def missing(nodes: Sequence[dict[str, Any]]) -> list[str]:
     """Return the commands that start what has never been heard of a whole graph."""
     heard = {node["own"] for node in nodes}
+    heard |= set(TRACKERS) if heard & set(TRACKERS) else set()
     return [start_of(name, None) for name in WANTED if name not in heard]
 
 
@@ -145,7 +149,8 @@ def _reason(node: dict[str, Any]) -> str:
 def start_of(name: str, node: dict[str, Any] | None) -> str:
     """Return the command that starts a node: as it was started, where that is known."""
     known = "" if node is None else node["command"]
-    package = {DRIVER: DRIVER, "apriltag_tracker": "apriltag_tracker"}.get(name, "der_planner")
+    package = "apriltag_tracker" if name in TRACKERS else "der_planner"
+    package = DRIVER if name == DRIVER else package
     return known or f"scripts/ros2 run {package} {name}"
 
 

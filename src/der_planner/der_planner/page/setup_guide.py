@@ -27,10 +27,11 @@ VENTED = 1.0
 """A segment counts as vented below this differential pressure [kPa]."""
 BOARD_SILENT = 0.5
 """A valve board counts as silent after this time [s] without telemetry."""
+MOCAP = "motion capture stands in its place: pose_tracker runs"
 CHAMBERS = "Each chamber has been filled alone"
 """Title of the step with the buttons that fill chambers."""
-CALIBRATION = "calibration-"
-"""The plans of `calibrate_limb.py` have names that begin so."""
+CHECK, CALIBRATION = "check-", "calibration-"
+"""The plans of `check_rig.py` and `calibrate_limb.py` have names that begin so."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,8 @@ class SetupGuide:
     def __init__(self, segments: int) -> None:
         self._chambers = [(segment, side) for segment in range(segments) for side in (1, -1)]
         self._driven: set[tuple[int, int]] = set()
-        self._calibrating = self._calibrated = False
+        self._playing = ""
+        self._played: set[str] = set()
 
     def steps(self, data: dict[str, Any], camera_problem: str, calibrated: bool) -> list[Step]:
         """Return all steps.
@@ -75,16 +77,17 @@ class SetupGuide:
         limb = data["limb"] if sources["tracker"]["fresh"] else None
         planned, identified = _planned_limb(data["nodes"])
         told = f"identified on {identified}" if identified else "which nobody identified"
+        mocap = _heard(data["nodes"], "pose_tracker") is not None
         self._watch(driver)
         return [
             _board(driver),
             _zero_pressure(driver),
             self._each_chamber(),
-            _camera(bool(sources["camera"]["fresh"]), calibrated),
+            _camera(bool(sources["camera"]["fresh"]), calibrated, mocap),
             Step(
                 "The camera's pose is known from the fixed tags",
-                calibrated and not camera_problem,
-                camera_problem or "the fixed tags fit together",
+                mocap or (calibrated and not camera_problem),
+                MOCAP if mocap else camera_problem or "the fixed tags fit together",
                 "Print tags with scripts/make_tags.py, enter their places in the tag map.",
             ),
             Step(
@@ -95,6 +98,7 @@ class SetupGuide:
                 else limb["reason"] or "tip at ({:.1f}, {:.1f}) cm".format(*limb["tip_cm"]),
                 "Light it evenly; tags should be 25 px wide or more.",
             ),
+            self._check(),
             self._calibration(identified),
             Step(
                 "The planner has this limb's own file",
@@ -108,8 +112,8 @@ class SetupGuide:
     def _watch(self, driver: dict[str, Any] | None) -> None:
         """Remember what the driver does now."""
         plan = "" if driver is None else driver["plan_id"]
-        self._calibrating = plan.startswith(CALIBRATION)
-        self._calibrated = self._calibrated or self._calibrating
+        self._playing = next((each for each in (CHECK, CALIBRATION) if plan.startswith(each)), "")
+        self._played.add(self._playing)
         pressures = [] if driver is None else [value or 0.0 for value in driver["measured_kpa"]]
         for index, value in enumerate(pressures):
             others = [abs(p) for k, p in enumerate(pressures) if k != index]
@@ -126,15 +130,29 @@ class SetupGuide:
             "that is said.",
         )
 
+    def _run(self, kind: str) -> tuple[bool, str]:
+        """Return whether a run of a kind has been played, and what to say of it."""
+        if self._playing == kind:
+            return False, "one is being played"
+        if kind in self._played:
+            return True, "one has been played"
+        return False, "none has been played since this page was opened"
+
+    def _check(self) -> Step:
+        return Step(
+            "A check of hoses, sensors and tags has been played",
+            *self._run(CHECK),
+            "`python3 scripts/check_rig.py --hardware RIG.yaml --out CHECKED.yaml` says which "
+            "valve fills which chamber; end all nodes but this page first.",
+        )
+
     def _calibration(self, identified: str) -> Step:
-        seen = "none has been played since this page was opened"
-        if self._calibrated:
-            seen = "one is being played" if self._calibrating else "one has been played"
-        elif identified:
+        done, seen = self._run(CALIBRATION)
+        if identified and CALIBRATION not in self._played:
             seen = f"the planner's limb was identified on {identified}"
         return Step(
             "A calibration run has been played",
-            bool(identified) or (self._calibrated and not self._calibrating),
+            done or bool(identified),
             seen,
             "`python3 scripts/calibrate_limb.py --graph --hardware RIG.yaml --out LIMB.yaml` plays "
             "and records one with nodes of its own: end all nodes but this page first.",
@@ -175,20 +193,33 @@ def _zero_pressure(driver: dict[str, Any] | None) -> Step:
     )
 
 
-def _camera(live: bool, calibrated: bool) -> Step:
+def _camera(live: bool, calibrated: bool, mocap: bool) -> Step:
     said = "pictures come" if live else "no fresh picture (they are only asked for while looked at)"
+    known = "its calibration is known" if calibrated else "it has sent no calibration"
     return Step(
         "The camera is calibrated",
-        calibrated,
-        f"{said}; {'its calibration is known' if calibrated else 'it has sent no calibration'}",
+        calibrated or mocap,
+        MOCAP if mocap else f"{said}; {known}",
         "scripts/calibrate_camera.py writes the camera_info file.",
+    )
+
+
+def _heard(nodes: Sequence[dict[str, Any]], name: str) -> dict[str, Any] | None:
+    """Return a node that is alive, None if there is none of the name."""
+    return next(
+        (
+            node
+            for node in nodes
+            if node["own"] == name and node["state"] not in ("late", "dead", "ended")
+        ),
+        None,
     )
 
 
 def _planned_limb(nodes: Sequence[dict[str, Any]]) -> tuple[str, str]:
     """Return the limb that the planner plans for, and when and on what it was identified."""
-    planner = next((node for node in nodes if node["own"] == "planner"), None)
-    if planner is None or planner["state"] in ("late", "dead", "ended"):
+    planner = _heard(nodes, "planner")
+    if planner is None:
         return "", ""
     values = planner["values"]
     return str(values.get("limb", "")), str(values.get("limb_identified", ""))
