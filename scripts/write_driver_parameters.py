@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Write the driver's parameter files and the page's table from their declaration."""
+"""Write the driver's parameter files from their declaration."""
 
 import sys
 

@@ -120,10 +120,10 @@ def draw_states(photographer: Photographer) -> None:
     graph.break_board("supply:105000")
     graph.wait_mode(PressureState.FAULT)
     take("fault")
-    graph.kill("pressure_driver")
+    graph.end("pressure_driver")
     says("The driver is dead")
     take("driver_dead")
-    graph.kill("page")
+    graph.end("page")
     says("No connection")
     take("page_dead")
 

@@ -43,7 +43,7 @@ def _check_machine() -> None:
 def _requirement_files() -> tuple[list[Path], list[Path]]:
     """Return the requirement files to install and the constraints (exact versions) to hold to."""
     folder = ROOT / "requirements"
-    wanted = [folder / "base.txt", folder / "page.txt", folder / "dev.txt"]
+    wanted = [folder / "base.txt", folder / "page.txt", folder / "dev.txt", folder / "docs.txt"]
     if uses_apt_ros():
         return wanted, []
     return [folder / "ros.txt", *wanted], [lock_file()] if lock_file().exists() else []

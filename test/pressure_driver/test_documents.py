@@ -27,10 +27,6 @@ def test_the_parameter_file_is_what_the_declaration_says(name):
     assert settings.NODES[name](**values) == settings.NODES[name]()
 
 
-def test_the_table_of_parameters_is_what_the_declaration_says():
-    assert driver_parameters.with_table(DRIVER) == DRIVER
-
-
 @pytest.mark.parametrize(
     ("values", "told"),
     [

@@ -131,7 +131,7 @@ class DiagnosticsPublisher:
             values["clock_offset_s"] = f"{offset.seconds:.6f}"
             values["clock_uncertainty_s"] = f"{offset.uncertainty:.6f}"
             if offset.warning and level == "ok":
-                level, text = "warning", offset.warning
+                level, text = "warning", f"{text}; {offset.warning}"
         values |= {
             "cpu_percent": f"{self._measure_cpu():.0f}",
             "process": self._process,

@@ -5,11 +5,17 @@ from __future__ import annotations
 import importlib
 import os
 import signal
+import sys
 from collections.abc import Callable
 from types import FrameType
 
 END_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 """What ends a node in order: Ctrl-C, a request, a terminal that was closed, and Ctrl-\\."""
+EXTRAS = {
+    name: name
+    for name in ("cobs", "distributed", "mcap", "nicegui", "piqp", "rosbags", "threadpoolctl")
+} | {"elastica": "pyelastica"}
+"""Modules that no rosdep key brings, and the packages of pip that do."""
 
 
 def on_end_signals(handler: Callable[[int, FrameType | None], None] | signal.Handlers) -> None:
@@ -29,10 +35,17 @@ def run_module(name: str) -> int:
         name: of the module.
 
     Returns:
-        What ``main`` returns, or 0.
+        What ``main`` returns, or 0; 1 where one of `EXTRAS` is missing, which is told.
     """
     on_end_signals(lambda *_: os._exit(0))
-    exit_code = int(importlib.import_module(name).main() or 0)
+    try:
+        exit_code = int(importlib.import_module(name).main() or 0)
+    except ModuleNotFoundError as error:
+        missing = (error.name or "").partition(".")[0]
+        if missing not in EXTRAS:
+            raise
+        print(f"error: this node needs '{missing}': pip install {EXTRAS[missing]}", file=sys.stderr)
+        return 1
     # A second signal must not change the exit code while Python takes itself down.
     on_end_signals(signal.SIG_IGN)
     return exit_code

@@ -32,7 +32,7 @@ CONNECT_TIME = 0.1
 ADVICE = "close the air supply"
 IN_USE = (errno.EAGAIN, errno.EBUSY, errno.EADDRINUSE)
 """Error numbers of a line that another program has."""
-_ADDRESS = re.compile(r"tcp://(\[[0-9A-Fa-f:.]+\]|[^:/\[\]]+):(\d{1,5})")
+_ADDRESS = re.compile(r"tcp://([^:/]+):(\d{1,5})")
 
 
 class Channel:
@@ -187,19 +187,7 @@ def tcp_address(port: str) -> tuple[str, int]:
     found = _ADDRESS.fullmatch(port)
     if not found or not 0 < int(found[2]) < 1 << 16:
         raise OSError(errno.EINVAL, f"'{port}' is no address: write tcp://host:port")
-    return found[1].strip("[]"), int(found[2])
-
-
-def numeric_address(port: str) -> str:
-    """Return `tcp://host:port` with the number of the host, so that nobody waits for a name again.
-
-    Raises:
-        OSError: the name of the host is not known.
-    """
-    host, number = tcp_address(port)
-    family, _, _, _, address = socket.getaddrinfo(host, number, type=socket.SOCK_STREAM)[0]
-    host = f"[{address[0]}]" if family == socket.AF_INET6 else str(address[0])
-    return f"tcp://{host}:{number}"
+    return found[1], int(found[2])
 
 
 def may_open(port: str) -> bool:

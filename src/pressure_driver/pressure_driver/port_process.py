@@ -35,7 +35,7 @@ from typing import Any
 from serial.tools import list_ports
 
 from pressure_driver import lines
-from pressure_driver.lines import Channel, is_tcp, numeric_address
+from pressure_driver.lines import Channel, is_tcp, tcp_address
 from pressure_driver.settings import Settings
 
 STABLE_NAMES = Path("/dev/serial/by-id")
@@ -73,7 +73,8 @@ def stable_name(port: str) -> str:
     """
     if is_tcp(port):
         with contextlib.suppress(OSError):
-            return numeric_address(port)
+            host, number = tcp_address(port)
+            return f"tcp://{socket.gethostbyname(host)}:{number}"
         return port
     if STABLE_NAMES.is_dir():
         for path in sorted(STABLE_NAMES.iterdir()):

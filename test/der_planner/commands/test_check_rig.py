@@ -66,9 +66,10 @@ def test_the_frame_of_a_map_without_fixed_bodies_is_found():
     arcs = np.array([body.arc_length for body in bodies.limb])
     clamp = find_clamp(bodies, arcs, [body.offset for body in bodies.limb], places)
     told = {"frame": json.dumps(tracker.base.frame.as_mapping()), **tracker.plane.values()}
-    frame = BaseFrame.from_mapping(found_frame(clamp, told))
+    frame = BaseFrame.from_mapping(found_frame(clamp, told, bodies.limb[0].height))
     # The axes of the limb's base in the frame of the poses.
     assert np.degrees(np.arccos(frame.rotation.T[:, 2] @ mocap.rotation[:, 2])) < 0.5
+    assert np.abs(frame.of(mocap.origin[None])).max() < 1e-3
     checked = BodyTracker(dataclasses.replace(bodies, frame=frame))
     tips = [checked.observe(each).followed.estimate.tip for each in frames]
     wrong = np.array(tips) - [shape.points[-1] for shape in shapes]

@@ -300,3 +300,11 @@ def test_a_wrong_shape_is_refused(planned):
         feedback.measure(0.0, [0.0, 0.0], [0.0, 0.0], np.eye(3))
     with pytest.raises(ValueError, match="2 differential pressures"):
         feedback.pressures(0.0, [0.0])
+
+
+def test_pressures_in_another_unit_end_feedback(planned):
+    feedback = Feedback(planned)
+    for time in 0.05 * np.arange(160):
+        feedback.pressures(time, 1e-3 * feedback.command(time))
+    assert feedback.reason == "pressures"
+    assert "told in Pa" in feedback.warnings[-1].message

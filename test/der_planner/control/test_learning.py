@@ -223,6 +223,8 @@ def test_arrays_that_do_not_fit_are_refused(first):
             learner.add(time, given, covariance)
     with pytest.raises(LearningError, match="commands must be finite"):
         learner.add(first.time, tip, commands=np.zeros((3, 2)))
+    with pytest.raises(LearningError, match="give Pa"):
+        learner.add(first.time, tip, commands=1e-3 * first.differential_pressure)
     assert learner.history == []
 
 

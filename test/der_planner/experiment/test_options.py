@@ -26,7 +26,7 @@ from der_planner.limb import Limb, PointMass
         (["--library", "/nowhere"], "/nowhere is no folder"),
         (["--poses", "--offline"], "--poses is motion capture of the twin"),
         (["--board", "arduino"], "unknown board 'arduino'"),
-        (["--board", "festo", "--offline"], "--offline has no board"),
+        (["--board", "festo", "--offline"], "--board is about the twin.s nodes"),
     ],
 )
 def test_a_bad_option_is_refused_by_its_name(arguments, named):

@@ -13,7 +13,7 @@ from der_planner.identification.bends import NODES, FreeTerms, predicted
 from der_planner.identification.excitation import sweep, waves
 from der_planner.identification.lengths import UnevenTips, uneven_tip, unevenness, with_lengths
 from der_planner.identification.log import Prepared
-from der_planner.limb import Limb, gravity_of
+from der_planner.limb import Limb, PointMass, gravity_of
 from der_planner.model import RodModel, simulate
 
 pytestmark = pytest.mark.slow
@@ -153,7 +153,7 @@ def test_mass_is_told_where_stiffness_is_given():
 def test_a_prior_that_its_rod_cannot_follow_is_refused_by_name():
     log = chain_log((0.0, 0.0, 0.0), amplitude=9000.0)
     rows = log.between(0.0, 6.0)
-    heavy = replace(prior((-9.81, 0.0, 0.0)), masses=()).carrying(1e4)
+    heavy = replace(prior((-9.81, 0.0, 0.0)), masses=(PointMass(0.244, 1e4),))
     with pytest.raises(LogError, match="check the prior's gravity, mass"):
         fit(heavy, rows, terms=())
     with pytest.raises(LogError, match="cannot follow this log"):

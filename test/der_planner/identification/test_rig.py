@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
@@ -49,7 +50,7 @@ def record(wiring: Wiring, seed: int) -> RigLog:
 
 @pytest.fixture(scope="module")
 def straight() -> RigLog:
-    return record(Wiring.straight(), seed=3)
+    return record(Wiring((1, 2, 3, 4)), seed=3)
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +78,11 @@ def wired(wiring: Wiring, straight: RigLog, mirrored: RigLog) -> RigLog:
 
 @pytest.mark.slow
 def test_all_384_wirings_are_found_and_those_that_contradict_themselves_refused(straight, mirrored):
-    wirings = list(Wiring.every())
+    orders, sides = itertools.permutations((1, 2, 3, 4)), itertools.product((1, -1), repeat=4)
+    wirings = [
+        Wiring(tuple(side * chamber for side, chamber in zip(signs, order, strict=True)))
+        for order, signs in itertools.product(orders, sides)
+    ]
     assert len(wirings) == 384
     playable = 0
     for wiring in wirings:

@@ -107,6 +107,11 @@ def test_another_limb_and_runs_too_short_are_refused():
     log = filmed(RUBBING, time, pressure)
     with pytest.raises(LogError, match="segment 0 bends the wrong way"):
         update(RUBBING, replace(log, bend_angles=-log.bend_angles))
+    with pytest.raises(LogError, match="segment 0 bends with input 1"):
+        update(RUBBING, replace(log, bend_angles=log.bend_angles[:, ::-1]))
+    leaking = np.where([True, False], np.maximum(log.bend_angles, 0.0), log.bend_angles)
+    with pytest.raises(LogError, match="segment 0 bends to the right by 0 %"):
+        update(RUBBING, replace(log, bend_angles=leaking))
     with pytest.raises(LogError, match=r"the runs last 3\.0 s"):
         update(RUBBING, log.between(0.0, 3.0))
     with pytest.raises(LogError, match="belongs to another limb"):

@@ -18,7 +18,6 @@ from der_planner.limb import (
     Segment,
     declarations,
 )
-from figures.limb_page import PAGE, page
 
 LIMB = Limb.default()
 DECLARED = [
@@ -32,10 +31,6 @@ def changed(kind: type, **change: float) -> Limb:
     if kind is Pneumatics:
         return replace(LIMB, pneumatics=replace(LIMB.pneumatics, **change))
     return replace(LIMB, segments=(LIMB.segments[0], replace(LIMB.segments[1], **change)))
-
-
-def test_the_page_is_current():
-    assert PAGE.read_text(encoding="utf-8") == page(), "run python3 scripts/write_limb_page.py"
 
 
 def test_the_default_limb_file_is_what_is_written(tmp_path):

@@ -44,6 +44,8 @@ def test_a_payload_of_nothing_changes_nothing_and_one_off_the_limb_is_refused():
         LIMB.carrying(0.01, at=0.3)
     with pytest.raises(LimbError, match=r"at least 0 kg, got -0\.01"):
         LIMB.carrying(-0.01)
+    with pytest.raises(LimbError, match="payload of 20 kg is 77 times the limb's mass: give kg"):
+        LIMB.carrying(20.0)
     base = dataclasses.replace(LIMB, base_length=0.02)
     assert base.carrying(0.01).masses[0].arc_length == pytest.approx(0.264)
     assert LIMB.carrying(0.01, 0.1).carrying(0.02).payload == (0.02, 0.0)

@@ -174,6 +174,8 @@ def test_wrong_input_is_named():
         simulate(LIMB, TIME)
     with pytest.raises(ValueError, match=r"\(K, 2\)"):
         simulate(LIMB, TIME, commands=COMMANDS[:-1])
+    with pytest.raises(ValueError, match=r"must be finite .* in row 1"):
+        simulate(LIMB, TIME, commands=np.where(TIME[:, None] == TIME[1], np.nan, COMMANDS))
     with pytest.raises(ValueError, match="evenly spaced"):
         simulate(LIMB, TIME**2, commands=COMMANDS)
 

@@ -16,7 +16,7 @@ from geometry_msgs.msg import Point
 from waiting import Clock, wait_for
 
 from der_msgs.msg import LimbState, PressurePlan, PressureState
-from der_planner.page.situation import DEAD, FORGOTTEN, FRESH, LATE, MOST_NODES, Situation
+from der_planner.page.situation import DEAD, FORGOTTEN, FRESH, LATE, MOST_NODES, SILENT, Situation
 from limb_interfaces.stamps import stamp_from_nanoseconds
 
 
@@ -50,9 +50,12 @@ def status(name: str, message: str, level: bytes = b"\0", process: str = "") -> 
 
 
 def test_data_grow_old(situation: Situation, clock: Clock) -> None:
+    assert situation.driver_mode == ""
     situation.put_driver(driver())
     assert situation.snapshot()["sources"]["driver"]["fresh"]
+    assert situation.driver_mode == "fault"
     clock.now += FRESH["driver"] + 0.01
+    assert situation.driver_mode == SILENT
     source = situation.snapshot()["sources"]["driver"]
     assert not source["fresh"]
     assert source["age"] == pytest.approx(FRESH["driver"], abs=0.02)

@@ -12,9 +12,6 @@ from apriltag_tracker.bodies.body_map import BodyMap
 from apriltag_tracker.bodies.tracker import PoseFrame
 from apriltag_tracker.synthetic.shapes import Shape
 
-_ORIGIN = np.array([0.4, -0.2, 0.9])
-"""Where the clamp is in the frame of the poses [m]."""
-
 
 @dataclass(frozen=True)
 class MocapFaults:
@@ -72,6 +69,8 @@ class SyntheticMocap:
         self.rotation: NDArray[np.float64] = (
             level @ Rotation.from_euler("zx", [turn, tilt]).as_matrix()
         )
+        self.origin = np.array([0.4, -0.2, 0.9])
+        """Where the clamp is in the frame of the poses [m]."""
         self._started: int | None = None
 
     def frame(self, stamp: int, shape: Shape) -> PoseFrame:
@@ -95,7 +94,7 @@ class SyntheticMocap:
             about = Rotation.from_euler("z", heading).as_matrix()
             positions[k] = np.array([x, y, body.height]) + about @ np.array([along, across, 0.0])
             axes[k] = about @ Rotation.from_euler("z", turn).as_matrix() @ body.rotation
-        positions = positions @ self.rotation.T + _ORIGIN
+        positions = positions @ self.rotation.T + self.origin
         positions += faults.position_noise * self._random.standard_normal((count, 3))
         noise = faults.direction_noise * self._random.standard_normal((count, 3))
         turns = Rotation.from_matrix(self.rotation @ axes) * Rotation.from_rotvec(noise)

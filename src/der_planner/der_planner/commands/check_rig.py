@@ -105,18 +105,20 @@ def _main(given: argparse.Namespace) -> int:
     if clamp is not None and not finding.contradictions:
         lines += clamp_lines(clamp)
         if isinstance(bodies, BodyMap) and not bodies.fixed and "frame" in told:
-            frame = found_frame(clamp, told)
+            height = float(np.mean([body.height for body in bodies.limb]))
+            frame = found_frame(clamp, told, height)
             lines.append("limb_base: found from the limb, for a map without fixed bodies")
     print("\n".join(lines))
-    driver = dict(hardware.driver) if hardware else {}
+    before = hardware.driver.get("wiring", "") if hardware else ""
     try:
-        driver["wiring"] = played_wiring(finding, str(driver.get("wiring", "")))
+        wiring = played_wiring(finding, str(before))
     except (HoseError, RigError) as error:
         print(f"no file is written: {error}", file=sys.stderr)
         return 3
     if given.out is not None:
         content = yaml.safe_load(given.hardware.read_text()) if given.hardware else {}
-        content |= {"driver": driver, "found": lines}
+        content["driver"] = {**content.get("driver", {}), "wiring": wiring}
+        content["found"] = lines
         given.out.parent.mkdir(parents=True, exist_ok=True)
         if frame is not None and hardware is not None and hardware.poses is not None:
             mapped = yaml.safe_load(Path(hardware.poses["body_map"]).read_text())
@@ -129,12 +131,13 @@ def _main(given: argparse.Namespace) -> int:
     return 0
 
 
-def found_frame(clamp: Clamp, told: Mapping[str, str]) -> dict[str, list[float]]:
+def found_frame(clamp: Clamp, told: Mapping[str, str], height: float) -> dict[str, list[float]]:
     """Return the key `frame` of a body map: at the clamp, with z across the plane of motion.
 
     Args:
         clamp: found in the frame that the tracker of bodies had.
         told: its diagnostics: that frame, and the plane's tilt.
+        height: of the bodies [m].
     """
     tilt, toward = (
         float(np.radians(float(told.get(key, 0.0))))
@@ -147,7 +150,9 @@ def found_frame(clamp: Clamp, told: Mapping[str, str]) -> dict[str, list[float]]
     along /= np.linalg.norm(along)
     axes = np.column_stack([along, np.cross(up, along), up])
     before = BaseFrame.from_mapping(yaml.safe_load(told["frame"]))
-    return before.moved(np.array([x, y, 0.0]), axes).as_mapping()
+    # The clamp was seen in the bodies' plane, which is that far above the centreline's.
+    origin = np.array([x, y, 0.0]) + height * (np.array([0.0, 0.0, 1.0]) - up)
+    return before.moved(origin, axes).as_mapping()
 
 
 def _tracker_values(bag: Path) -> dict[str, str]:

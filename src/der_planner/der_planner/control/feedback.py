@@ -27,6 +27,7 @@ from der_planner.control.nominal import ChamberLog, Nominal
 from der_planner.control.reaction import Kind, Reaction
 from der_planner.control.supervisor import Supervisor, Warned
 from der_planner.control.touch import Touch, TouchSense
+from der_planner.limb.plausible import TOO_SMALL, impossible
 from der_planner.model import CONTROL_PERIOD, STEPS
 from der_planner.model.commands import within_limits
 from der_planner.planning.plan_file import Plan
@@ -36,6 +37,8 @@ _AUTHORITY = 0.4
 """Largest correction, as a share of the limb's pressure limit."""
 _SOON = 10
 """Coming commands that may be played before the next ones are known, and must keep off a touch."""
+_FILLED = 0.1
+"""Command from which on chambers must hold something, as a share of the limb's pressure limit."""
 
 
 class Feedback:
@@ -121,9 +124,15 @@ class Feedback:
         Raises:
             ValueError: another shape.
         """
-        changed = self._chambers.read(time, differential)
+        values, limb = np.asarray(differential, dtype=float), self.plan.limb
+        beyond = bool(impossible(limb, "pressures", values))
+        changed = self._chambers.read(time, np.full_like(values, np.nan) if beyond else values)
         if changed is not None:
             self._estimator.changed(changed)
+        asked = np.abs(self._chambers.sent(round(time / CONTROL_PERIOD)))
+        filled = asked > _FILLED * limb.pneumatics.pressure_limit
+        empty = bool(np.any(filled & (np.abs(values) < TOO_SMALL * asked)))
+        self._supervisor.held(time, float(np.abs(values).max()), not (beyond or empty))
 
     def measure(
         self,

@@ -39,6 +39,7 @@ from der_planner.control.disturbance import (
 from der_planner.control.repeatability import PlayedRun, Runs
 from der_planner.identification.update import adapted
 from der_planner.limb import Limb, LimbError
+from der_planner.limb.plausible import TOO_SMALL
 from der_planner.methods import LEARNED
 from der_planner.planning.correction import PULL, Correction
 from der_planner.planning.loads import PlanningError
@@ -257,6 +258,12 @@ class Learner:
                 raise LearningError(
                     f"commands must be finite, of shape {plan.differential_pressure.shape}, got "
                     f"{given.shape}: give those of all setpoints of the plan"
+                )
+            largest, planned = (float(np.abs(c).max()) for c in (given, plan.differential_pressure))
+            if largest < TOO_SMALL * planned:
+                raise LearningError(
+                    f"the commands in force are {largest:.3g} Pa at the most, those of the "
+                    f"plan {planned:.0f} Pa: give Pa"
                 )
         expected = self._runs.expected(given) or self._correction.expected(given)
         shown = disturbance(measured, plan.time, expected.tip)

@@ -23,6 +23,8 @@ REASONS = {
     "oscillation": "corrections swing by {:.0f} Pa, and neither they nor the limb come to rest",
     "saturation": "a correction is at its limit of {:.0f} Pa, and the tip far from its path",
     "late": "commands come {:.2f} s after their instant",
+    "pressures": "chambers are said to hold {:.3g} Pa, which no command has made: are pressures "
+    "told in Pa, and is the supply open?",
 }
 """Every reason with the sentence of its warning."""
 _GOES_ON = 0.7
@@ -50,6 +52,8 @@ _TURNS = 6
 """Number of turns within the window that are an oscillation, unless it begins or dies out."""
 _WINDOW = 4.0
 """Time in which the turns are counted [s]."""
+_STRANGE = 1.5
+"""Time for which chambers may be said to hold what no command has made [s]."""
 _LATE = 4.0
 """Number of commands that may come too late; one in time makes up for half of one."""
 
@@ -134,6 +138,11 @@ class Supervisor:
         distance = self._oscillation()
         if distance > 0.0 and time - self._astray_at <= _WINDOW:
             self.stop(time, "oscillation", distance)
+
+    def held(self, time: float, pressure: float, possible: bool) -> None:
+        """Look at what chambers are said to hold [Pa], and whether commands can have made it."""
+        if self._lasts("pressures", not possible, time) > _STRANGE:
+            self.stop(time, "pressures", pressure)
 
     def _lasts(self, what: str, now: bool, time: float) -> float:
         """Return for how long something has been so at an instant, without a break [s]."""

@@ -149,19 +149,14 @@ class RunningGraph:
             return
         told = ", ".join(f"{name} on {host}" for name, host in self.elsewhere.items())
         self.progress.say(f"  waiting for {told}")
-        seen = self.client.diagnostics
         try:
-            self.client.wait_for(
-                lambda: self.elsewhere.keys() <= seen.keys(), ELSEWHERE, "nodes elsewhere"
-            )
+            self.client.wait_ready(self.elsewhere, ELSEWHERE, ELSEWHERE)
         except GraphError as error:
-            missing = [f"{n} on {host}" for n, host in self.elsewhere.items() if n not in seen]
             raise GraphError(
-                f"nothing was heard of {', '.join(missing)} for {ELSEWHERE:.0f} s: is it started, "
-                "with the same ROS_DOMAIN_ID, ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET on both "
-                "computers and no firewall between them (docs/guide/two_computers.md)?"
+                f"{error} ({told}). Is it started, with the same ROS_DOMAIN_ID, with "
+                "ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET on both computers, and is there no firewall "
+                "between them (docs/guide/two_computers.md)?"
             ) from error
-        self.client.wait_ready(self.elsewhere)
         for name, host in self.elsewhere.items():
             theirs = self.client.diagnostic_values(name).get("messages", "unknown")
             if theirs != message_version():

@@ -272,17 +272,14 @@ def parse(arguments: Sequence[str]) -> Options:
             "--offline simulates everything: it does not go with --hardware",
         ),
         (
+            given.board != BOARDS[0] and (given.offline or hardware is not None),
+            "--board is about the twin's nodes: not for --offline; a file of --hardware names its "
+            "own as driver.protocol",
+        ),
+        (
             given.poses and (given.offline or hardware is not None),
             "--poses is motion capture of the twin: it goes with neither --offline nor --hardware "
             "(a hardware file has the key poses)",
-        ),
-        (
-            hardware is not None and given.board != BOARDS[0],
-            "--board is about the twin: with --hardware, driver.protocol of the file says it",
-        ),
-        (
-            given.offline and given.board != BOARDS[0],
-            "--offline has no board: it does not go with --board",
         ),
         (
             hardware is not None and limb is None,

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from der_planner.arrays import Array
 from der_planner.limb import Limb
+from der_planner.limb.plausible import FEW, TOO_SMALL, impossible, outliers
 from der_planner.model import CONTROL_PERIOD
 
 LONGEST_GAP = 1.0
@@ -22,6 +23,12 @@ LEAST_SEEN = 0.05
 """Share of a log to predict in which the tags must be seen."""
 SWING = np.deg2rad(0.5)
 """Amplitude below which a swing need not be waited for [rad]."""
+LONGEST_PERIOD = 5.0
+"""Median time between two rows above which the time must have another unit [s]."""
+LEAST_DURATION = 1.0
+"""Duration below which it must, too [s]."""
+LEAST_MOTION = np.deg2rad(3.0)
+"""Range of motion from which on gains are judged [rad]."""
 LONGEST_SWING = 12.0
 """Longest time at the beginning of a log that is waited for a swing to end [s]."""
 
@@ -176,8 +183,9 @@ def prepare(
             f"the log has {log.segment_count} segments, the limb '{limb.name}' "
             f"{limb.segment_count}: this limb file belongs to another limb"
         )
-    grid = log.resampled(CONTROL_PERIOD, longest_gap)
+    _check_time(log)
     warnings: list[str] = []
+    grid = _without_outliers(log, limb, warnings).resampled(CONTROL_PERIOD, longest_gap)
     valid = np.all(np.isfinite(grid.bend_angles), axis=1)
     least = LEAST_VALID if to_fit else LEAST_SEEN
     if valid.mean() < least:
@@ -195,10 +203,11 @@ def prepare(
             )
     pressure, bend = bridge(grid.measured_differential), bridge(grid.bend_angles)
     swinging = _still_swinging(grid.time, pressure, bend, limb)
+    _check_scale(pressure, bend, limb)
     if to_fit:
         _check_tips(grid, limb)
         _check_commands(grid)
-        _check_excitation(pressure[valid & ~swinging], limb)
+        _check_excitation(pressure[valid & ~swinging])
         _check_match(pressure, bend, warnings)
     if swinging.any():
         grid.bend_angles[swinging], grid.tip[swinging] = np.nan, np.nan
@@ -225,6 +234,33 @@ def _still_swinging(time: Array, pressure: Array, bend: Array, limb: Limb) -> ND
     decay = 0.5 * max(float(np.mean([s.damping for s in limb.segments])), 0.2)
     swing = min(float(np.log(amplitude / SWING)) / decay, LONGEST_SWING, 0.2 * elapsed[-1])
     return np.asarray(elapsed < swing)
+
+
+def _check_time(log: CalibrationLog) -> None:
+    """Refuse a log whose time is not in seconds."""
+    period, duration = float(np.median(np.diff(log.time))), float(np.ptp(log.time))
+    if period > LONGEST_PERIOD or duration < LEAST_DURATION:
+        raise LogError(
+            f"the log lasts {duration:.3g} s, with a row every {period:.3g} s: give the time in "
+            "seconds, or name its unit (time_unit)"
+        )
+
+
+def _without_outliers(log: CalibrationLog, limb: Limb, warnings: list[str]) -> CalibrationLog:
+    """Return the log without single numbers that no such limb shows."""
+    far = impossible(limb, "tips", log.tip)
+    wrong = {
+        "pressures": outliers(limb, "pressures", log.measured_differential, LogError),
+        "bend angles": outliers(limb, "bend angles", log.bend_angles, LogError),
+        "tips": far & (far.mean() <= FEW),  # `_check_tips` refuses many
+    }
+    for what, rows in wrong.items():
+        if rows.any():
+            warnings.append(f"{rows.sum()} rows have {what} that no such limb has: left out")
+    tables = (log.measured_differential, log.bend_angles, log.tip)
+    pairs = zip(wrong.values(), tables, strict=True)
+    pressures, bends, tips = (np.where(rows[:, None], np.nan, table) for rows, table in pairs)
+    return replace(log, measured_differential=pressures, bend_angles=bends, tip=tips)
 
 
 def _check_tips(log: CalibrationLog, limb: Limb) -> None:
@@ -255,13 +291,19 @@ def _check_commands(log: CalibrationLog) -> None:
             )
 
 
-def _check_excitation(pressure: Array, limb: Limb) -> None:
-    largest, limit = np.abs(pressure).max(), limb.pneumatics.pressure_limit
-    if not 100.0 < largest < 20.0 * limit:
+def _check_scale(pressure: Array, bend: Array, limb: Limb) -> None:
+    """Refuse pressures that are far too small for the bends that they go with."""
+    driven = float((limb.static_gain * np.ptp(pressure, axis=0)).max())
+    moved = float(np.ptp(bend, axis=0).max())
+    if moved > LEAST_MOTION and driven < TOO_SMALL * moved:
         raise LogError(
-            f"the largest measured differential pressure is {largest:.3g} Pa, the limb's limit "
-            f"{limit:.0f} Pa: check the units of the log"
+            f"segments bend by {np.degrees(moved):.0f}° while their pressures change by "
+            f"{np.ptp(pressure, axis=0).max():.3g} Pa: check the units of the log, and that "
+            "nobody moves the limb"
         )
+
+
+def _check_excitation(pressure: Array) -> None:
     for index, value in enumerate(np.std(pressure, axis=0)):
         if value < LEAST_EXCITATION:
             raise LogError(

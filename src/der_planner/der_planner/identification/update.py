@@ -51,6 +51,8 @@ MOST_FRICTION_CHANGE = 20.0
 """Largest change of a friction in a fit, in spreads of a day."""
 WRONG_WAY = -0.5
 """Correlation of predicted and measured bend below which pressure and bend have other signs."""
+ONE_SIDED = 0.2
+"""Share of the gain of one side that the other side has at least."""
 LEAST_DURATION = 5.0
 """Least duration of all runs together [s]."""
 CALIBRATE_AGAIN = math.radians(3.0)
@@ -225,7 +227,7 @@ def update(limb: Limb, logs: CalibrationLog | Sequence[CalibrationLog]) -> tuple
             f"the rod of the limb '{limb.name}' cannot follow these runs: check that they are of "
             "this limb, with its mounting and what it carries"
         ) from error
-    _refuse_wrong_way(runs, remaining)
+    _refuse_other_limbs(runs, remaining)
     values, deviation = _solve(every, runs)
     before, after = (
         np.sqrt(np.nanmean(left**2, axis=0)) for left in (remaining, whole.remaining(values))
@@ -272,26 +274,44 @@ def _solve(every: DayTerms, runs: Sequence[Prepared]) -> tuple[Array, Array]:
     return values, deviation
 
 
-def _refuse_wrong_way(runs: Sequence[Prepared], remaining: Array) -> None:
-    """Refuse runs in which a segment bends against its pressure.
+def _refuse_other_limbs(runs: Sequence[Prepared], remaining: Array) -> None:
+    """Refuse runs in which a segment bends as no day makes it.
 
     Args:
         runs: prepared.
         remaining: (K, M) measured less predicted bend of all runs [rad].
 
     Raises:
-        LogError: a segment does.
+        LogError: a segment bends against its pressure, with another's, or to one side only.
     """
-    measured = np.concatenate([run.log.bend_angles for run in runs])
     rows = np.isfinite(remaining).all(axis=1)
-    expected = measured - remaining
-    for m, (seen, told) in enumerate(zip(measured[rows].T, expected[rows].T, strict=True)):
-        moved = min(np.ptp(seen), np.ptp(told)) >= LEAST_MOTION
-        if moved and np.corrcoef(seen, told)[0, 1] < WRONG_WAY:
+    measured = np.concatenate([run.log.bend_angles for run in runs])[rows]
+    expected = measured - remaining[rows]
+    moved = np.minimum(np.ptp(measured, axis=0), np.ptp(expected, axis=0)) >= LEAST_MOTION
+    for m in map(int, np.flatnonzero(moved)):
+        seen, told = measured[:, m], expected[:, m]
+        alike = {int(n): np.corrcoef(seen, expected[:, n])[0, 1] for n in np.flatnonzero(moved)}
+        most = max(alike, key=alike.__getitem__)
+        if alike[m] < WRONG_WAY:
             raise LogError(
                 f"segment {m} bends the wrong way in these runs: check that they are of this limb, "
                 "that no tubes, signs or columns are swapped, and that what it carries is named; "
                 "else calibrate again"
+            )
+        if alike[m] < 0.5 and alike[most] > 0.8:
+            raise LogError(
+                f"segment {m} bends with input {most}, not with input {m}: columns or tubes are "
+                "swapped, or the runs are of another limb"
+            )
+        if min(told.max(), -told.min()) < 2.0 * LEAST_MOTION:
+            continue
+        sides = {"left": told > LEAST_MOTION, "right": told < -LEAST_MOTION}
+        gains = {name: np.polyfit(told[side], seen[side], 1)[0] for name, side in sides.items()}
+        worst = min(gains, key=gains.__getitem__)
+        if gains[worst] < ONE_SIDED * max(gains.values()):
+            raise LogError(
+                f"segment {m} bends to the {worst} by {abs(100 * gains[worst]):.0f} % of what its "
+                "pressure should do, to the other side as it should: a chamber or tube there leaks"
             )
 
 

@@ -1,8 +1,7 @@
 """What a parameter of a limb is declared with, and what follows from the declaration.
 
 A dataclass field carries a `Parameter` in its metadata. From it come the check of the value, the
-comment behind the key in a limb file, the row in docs/reference/limb_parameters.md and the
-unknown of the fit.
+comment behind the key in a limb file, its row on the site's page and the unknown of the fit.
 """
 
 from __future__ import annotations

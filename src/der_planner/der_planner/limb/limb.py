@@ -43,6 +43,8 @@ from der_planner.limb.loads import (
 from der_planner.limb.parameters import CalibratedRange, Pneumatics, Segment
 
 SCHEMA_VERSION = 1
+MOST_CARRIED = 10.0
+"""Largest payload over what the limb weighs: more is a mistake in the unit."""
 DEFAULT_LIMB_FILE = Path(__file__).resolve().parents[1] / "data" / "default_limb.yaml"
 
 
@@ -211,10 +213,16 @@ class Limb:
             name: of the mass.
 
         Raises:
-            LimbError: a negative mass, or a place that is not on the limb.
+            LimbError: a negative mass, one far beyond what the limb weighs itself, or a place that
+                is not on the limb.
         """
         if payload == 0:
             return self
+        if payload > MOST_CARRIED * self.mass:
+            raise LimbError(
+                f"the {name} of {payload:g} kg is {payload / self.mass:.0f} times the limb's mass: "
+                "give kg"
+            )
         place = self.length if at is None else float(at)
         if 0 < place - self.length <= BEYOND_THE_TIP:
             place = self.length
@@ -327,7 +335,7 @@ class Limb:
     def to_yaml(self, path: str | Path) -> None:
         """Write a limb file that `from_yaml` reads back as an equal limb, whole or not at all."""
         text = yaml.safe_dump(self.to_mapping(), sort_keys=False, allow_unicode=True)
-        head = "# A limb, in SI units. How to choose each: docs/reference/limb_parameters.md\n"
+        head = "# A limb, in SI units. How to choose each: the site, python3 scripts/docs.py\n"
         file = Path(path)
         unfinished = file.with_name(f".{file.name}.part")
         unfinished.write_text(head + commented(text, sections()), encoding="utf-8")

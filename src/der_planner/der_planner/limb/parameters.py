@@ -1,7 +1,6 @@
 """The parameters of a limb, each declared once: unit, meaning, how to choose it, range, fit.
 
-Checks, comments in limb files, docs/reference/limb_parameters.md and the unknowns of the fit follow
-from here.
+Checks, comments in limb files, the site's page and the unknowns of the fit follow from here.
 """
 
 from __future__ import annotations

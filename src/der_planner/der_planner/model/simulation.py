@@ -192,6 +192,9 @@ def _check(
             f"expected time (K,) of two instants or more and commands or pressures (K, {inputs}), "
             f"got {time.shape} and {given.shape}"
         )
+    if not np.isfinite(given).all():
+        row = int(np.flatnonzero(~np.isfinite(given).all(axis=1))[0])
+        raise ValueError(f"pressures must be finite [Pa], got {given[row]} in row {row}")
     if not np.allclose(np.diff(time), time[1] - time[0], rtol=1e-6, atol=1e-9):
         raise ValueError("the instants must be evenly spaced: resample the series first")
     return given

@@ -42,6 +42,8 @@ MODES = {
     "fault": "vented: something failed",
 }
 """The driver's modes, in the order of their numbers, and what each means for the limb."""
+SILENT = "silent"
+"""In place of the mode of a driver that is not heard any more."""
 FORGOTTEN = 60.0
 """A node that is none of this limb's is forgotten after this time [s] without diagnostics."""
 MOST_NODES = 30
@@ -193,10 +195,12 @@ class Situation:
 
     @property
     def driver_mode(self) -> str:
-        """Name of the driver's mode; empty if it has not been heard lately."""
+        """Name of the driver's mode; `SILENT` if it is heard no more, empty if it never was."""
         with self._lock:
-            age = self._clock() - self._heard.get("driver", -math.inf)
-            return str(self._values["driver"]["mode"]) if age <= FRESH["driver"] else ""
+            if "driver" not in self._values:
+                return ""
+            fresh = self._clock() - self._heard["driver"] <= FRESH["driver"]
+            return str(self._values["driver"]["mode"]) if fresh else SILENT
 
     def value_of(self, node: str, key: str) -> str:
         """Return what the newest diagnostics of a node of this limb say under a key, or nothing."""

@@ -16,6 +16,7 @@ from der_planner.page.forms import FormError, MotionForm
 from der_planner.page.server import STATIC, Parts
 from der_planner.page.setup_guide import ADDRESS as SETUP_ADDRESS
 from der_planner.page.setup_guide import RECONNECT, add_frame, add_setup_guide, show_answer
+from der_planner.page.situation import SILENT
 
 PING = 3.0
 """The framework notices a connection that is gone within about this time [s]."""
@@ -28,6 +29,12 @@ SOURCES = {
     MOTION: "Named motion", LEARNED_PLAN: "Learned plan", DRAWING: "Drawing", AGAIN: "Last plan",
 }  # fmt: skip
 """What the one play button plays."""
+OBSTACLES = {
+    "disarmed": "the limb is disarmed: arm first",
+    "fault": "the limb was vented after a fault: remove the cause, then arm",
+    SILENT: "the driver is silent: see the alarm",
+}
+"""Why nothing is played in a mode of the driver."""
 CURVES = {
     "pressure": ("Differential pressure", "kPa", ("measured", "commanded")),
     "bend": ("Bend angle", "°", ("measured",)),
@@ -119,9 +126,8 @@ class OperatorWindow:
             return "take control first"
         if name != "play":
             return ""
-        mode = self._parts.situation.driver_mode
-        if mode in ("disarmed", "fault"):
-            return f"the limb is {mode}: arm first"
+        if obstacle := OBSTACLES.get(self._parts.situation.driver_mode):
+            return obstacle
         if self._source.value == DRAWING and not self._drawing.ready:
             return "draw on the picture first, and wait for the preview"
         if self._source.value == LEARNED_PLAN and not self._form.learned:
@@ -212,19 +218,19 @@ def add_curves(segments: int) -> None:
             for segment in range(segments)
         ]  # fmt: skip
         tip = {"name": "tip", "type": "line", "showSymbol": False, "color": COLOURS[0]}
+        rows = 2 if len(kinds) > 1 else 1  # of the legend
         chart = ui.echart(
             {
                 "animation": False,
-                "title": {"text": f"{title} [{unit}]", "left": 0, "textStyle": {"fontSize": 12}},
-                "legend": {
-                    "top": 16,
-                    "left": 0,
-                    "type": "scroll",
-                    "itemHeight": 8,
-                    "itemGap": 6,
-                    "textStyle": {"fontSize": 10},
+                "title": {
+                    "text": f"{title} [{unit}]", "left": 0, "top": 0, "padding": 0,
+                    "textStyle": {"fontSize": 12},
                 },
-                "grid": {"left": 36, "right": 14, "top": 40, "bottom": 20},
+                "legend": {
+                    "top": 18, "left": 0, "padding": 0, "itemHeight": 8, "itemWidth": 18,
+                    "itemGap": 6, "textStyle": {"fontSize": 10},
+                },
+                "grid": {"left": 36, "right": 14, "top": 22 + 14 * rows, "bottom": 20},
                 "xAxis": {"type": "value", "min": -30, "max": 0, "name": "s", "nameGap": 4},
                 # Noise of a limb at rest is not drawn as if it were motion.
                 "yAxis": {"type": "value", "splitNumber": 3, "minInterval": 1 if kinds else 0.1},
@@ -232,6 +238,6 @@ def add_curves(segments: int) -> None:
                 "dataZoom": [{"type": "inside"}],
                 "series": series or [tip],
             }
-        )
+        )  # fmt: skip
         numbers[name] = chart.classes("curve").id
     ui.add_body_html(f"<script>page.curves = {json.dumps(numbers)};</script>")

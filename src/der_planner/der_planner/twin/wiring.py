@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,19 +33,6 @@ class Wiring:
                 f"wiring {list(self.chambers)}: name each of the chambers 1 to {count} once, with "
                 "a minus sign where it bends the other way"
             )
-
-    @classmethod
-    def straight(cls, segment_count: int = 2) -> Wiring:
-        """Return the wiring that everybody expects."""
-        return cls(tuple(range(1, 2 * segment_count + 1)))
-
-    @classmethod
-    def every(cls, segment_count: int = 2) -> Iterator[Wiring]:
-        """Yield all wirings with all signs: 384 of a limb with two segments."""
-        count = 2 * segment_count
-        for order in itertools.permutations(range(1, count + 1)):
-            for signs in itertools.product((1, -1), repeat=count):
-                yield cls(tuple(s * k for s, k in zip(signs, order, strict=True)))
 
     @property
     def moves(self) -> tuple[tuple[int, int], ...]:

@@ -13,7 +13,6 @@ from pressure_driver.protocols.festo import (
     FIRST_INPUT,
     FIRST_OUTPUT,
     INACTIVE,
-    INPUTS,
     LARGEST_SETPOINT,
     PASCAL_PER_MILLIBAR,
     REGULATE,
@@ -91,7 +90,7 @@ class FestoBoard(BoardProtocol):
     def _interpret(self, place: int, frame: modbus.ModbusFrame) -> BoardCommand:
         function, data, number = frame.function, frame.data, frame.transaction
         first, count = modbus.BLOCK.unpack(data[:4].ljust(4, b"\0"))
-        if function == modbus.READ and self._registers(first, count, None):
+        if function == modbus.READ:
             return BoardCommand("read", place, sequence=number, text=f"{first} {count}")
         words, offset = modbus.to_words(data[5:]), first - FIRST_OUTPUT
         inside = 0 <= offset <= len(self._outputs) - count
@@ -108,8 +107,7 @@ class FestoBoard(BoardProtocol):
                 text=f"{first} {count}",
             )
         self.rejected += 1
-        known = function in (modbus.READ, modbus.WRITE)
-        problem = ILLEGAL_ADDRESS if known else ILLEGAL_FUNCTION
+        problem = ILLEGAL_ADDRESS if function == modbus.WRITE else ILLEGAL_FUNCTION
         return BoardCommand("refused", place, sequence=number, text=f"{function} {problem}")
 
     def _setpoints(self) -> tuple[float, ...]:
@@ -130,12 +128,10 @@ class FestoBoard(BoardProtocol):
             for chamber, value in enumerate(pressure)
         ]
 
-    def _registers(self, first: int, count: int, reading: BoardReading | None) -> list[int]:
+    def _registers(self, first: int, count: int, reading: BoardReading) -> list[int]:
         """Return what registers hold, or nothing if there are none of these numbers."""
-        inputs = [0] * (INPUTS * (len(self.slots) or self.chamber_count))
-        if reading is not None:
-            inputs = self._inputs(reading)
-        for begin, registers in ((FIRST_OUTPUT, self._outputs), (FIRST_INPUT, inputs)):
+        held = ((FIRST_OUTPUT, self._outputs), (FIRST_INPUT, self._inputs(reading)))
+        for begin, registers in held:
             if begin <= first and first + count <= begin + len(registers):
                 return registers[first - begin : first - begin + count]
         return []
@@ -162,6 +158,8 @@ class FestoBoard(BoardProtocol):
         if command.kind == "setpoint":
             return modbus.encode(number, modbus.WRITE, modbus.BLOCK.pack(first, second))
         data = modbus.to_bytes(self._registers(first, second, reading))
+        if not data:
+            return modbus.encode(number, modbus.READ | modbus.FAILED, bytes([ILLEGAL_ADDRESS]))
         return modbus.encode(number, modbus.READ, bytes([len(data)]) + data)
 
     def expired(self) -> bytes:

@@ -210,6 +210,7 @@ class HostProtocol(ABC):
         """The newest of them, where the protocol has lines."""
         self.unsettled = ""
         """Why no pressure may be commanded yet, though the board talks; empty if it may."""
+        self._follow_up = b""
 
     def configure(self, settings: Settings) -> None:  # noqa: B027 - most boards have no parameters
         """Take over the parameters that are for this board alone."""
@@ -236,9 +237,9 @@ class HostProtocol(ABC):
             The bytes, and the number that the board's echo will carry (None: it has no numbers).
         """
 
-    @abstractmethod
     def vent(self, atmosphere: float) -> tuple[bytes, int | None]:
-        """Encode the command that opens every chamber to the atmosphere."""
+        """Encode the command that opens every chamber to the atmosphere, or regulates to it."""
+        return self.setpoint([0.0] * (self.chamber_count // 2), atmosphere, 0.0)
 
     def emergency(self, atmosphere: float) -> list[bytes]:
         """Return what empties a board in any state, for a process that knows nothing about it.
@@ -250,7 +251,8 @@ class HostProtocol(ABC):
 
     def follow_up(self) -> bytes:
         """Return what is to be sent at once because of what has been decoded."""
-        return b""
+        data, self._follow_up = self._follow_up, b""
+        return data
 
     @abstractmethod
     def decode(self, data: bytes) -> list[Event]:

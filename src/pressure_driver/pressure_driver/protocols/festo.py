@@ -34,10 +34,10 @@ from pressure_driver.protocols.modbus import (
     WRITE,
     ModbusFrame,
     ModbusReader,
-    read_request,
+    encode,
     signed,
+    to_bytes,
     to_words,
-    write_request,
 )
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ LARGEST_SETPOINT = 7000
 REGULATE, INACTIVE, ACKNOWLEDGE = 3, 61, 62
 FIRST_VALVE, BOTH_VALVES = 1, 3
 STATES = ("not ready", "to be configured", "running", "failed")
-RUNNING, FAILURE = 2, 3
+RUNNING = 2
 ACKNOWLEDGE_TIME = 0.5
 """[s] for which a slot is told to acknowledge."""
 START_TIME = 20.0
@@ -94,8 +94,8 @@ class FestoHost(HostProtocol):
     def reset(self) -> None:
         """Forget a half-received frame and whether the valves run."""
         self._frames.reset()
-        self._sound = self._written = False
-        self._acknowledging = False
+        self._follow_up = b""
+        self._sound = self._acknowledging = False
         self._started_at = -math.inf
         self._modes: set[int] = set()
         self.doubt()
@@ -130,20 +130,9 @@ class FestoHost(HostProtocol):
         ]
         return self._write(values, self._acknowledging), self._transaction
 
-    def vent(self, atmosphere: float) -> tuple[bytes, int | None]:
-        """Regulate every chamber to the room's pressure."""
-        return self.setpoint([0.0] * (self.chamber_count // 2), atmosphere, 0.0)
-
     def emergency(self, atmosphere: float) -> list[bytes]:  # noqa: ARG002
         """Regulate to the room's pressure, also where slots are being acknowledged."""
         return [self._write([0] * self.chamber_count, False)]
-
-    def follow_up(self) -> bytes:
-        """Ask for all pressures once a write has been answered."""
-        if not self._written:
-            return b""
-        self._written = False
-        return read_request(self._next(), FIRST_INPUT, INPUTS * self._places)
 
     @property
     def _places(self) -> int:
@@ -166,7 +155,8 @@ class FestoHost(HostProtocol):
                 for left, right in zip(values[0::2], values[1::2], strict=True)
                 for word in (mode, left, right)
             ]
-        return write_request(self._next(), FIRST_OUTPUT, words)
+        head = BLOCK.pack(FIRST_OUTPUT, len(words)) + bytes([2 * len(words)])
+        return encode(self._next(), WRITE, head + to_bytes(words))
 
     # ----------------------------------------------------------------------- from the terminal
 
@@ -183,7 +173,8 @@ class FestoHost(HostProtocol):
 
     def _interpret(self, frame: ModbusFrame) -> list[Event]:
         if frame.function == WRITE and len(frame.data) == BLOCK.size:
-            self._written = True
+            block = BLOCK.pack(FIRST_INPUT, INPUTS * self._places)
+            self._follow_up = encode(self._next(), READ, block)
             return [Echo(frame.transaction)]
         if frame.function in (READ | FAILED, WRITE | FAILED) and len(frame.data) == 1:
             asked = "read" if frame.function == READ | FAILED else "write"

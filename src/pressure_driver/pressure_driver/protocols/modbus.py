@@ -8,7 +8,7 @@ numbers are those on the wire, which count from 0, as in libmodbus.
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import NamedTuple
 
 from pressure_driver.protocols import FrameBuffer
@@ -38,17 +38,6 @@ class ModbusFrame(NamedTuple):
 def encode(transaction: int, function: int, data: bytes) -> bytes:
     """Return the bytes of a frame."""
     return HEADER.pack(transaction & 0xFFFF, 0, len(data) + 2, UNIT, function) + data
-
-
-def read_request(transaction: int, first: int, count: int) -> bytes:
-    """Ask for ``count`` registers from ``first`` on."""
-    return encode(transaction, READ, BLOCK.pack(first, count))
-
-
-def write_request(transaction: int, first: int, words: Sequence[int]) -> bytes:
-    """Write registers from ``first`` on."""
-    head = BLOCK.pack(first, len(words)) + bytes([2 * len(words)])
-    return encode(transaction, WRITE, head + to_bytes(words))
 
 
 def to_bytes(words: Iterable[int]) -> bytes:

@@ -119,18 +119,9 @@ class PneudriveHost(HostProtocol):
         self._untold = deque(frames[self._first :] + frames[: self._first])
         return self._tell_next(), None
 
-    def vent(self, atmosphere: float) -> tuple[bytes, int | None]:
-        """Regulate every chamber to the room's pressure."""
-        return self.setpoint([0.0] * (self.chamber_count // 2), atmosphere, 0.0)
-
     def emergency(self, atmosphere: float) -> list[bytes]:  # noqa: ARG002
         """One frame a board, to be sent in turn."""
         return self._encode([0.0] * (self.chamber_count // 2))
-
-    def follow_up(self) -> bytes:
-        """Return the targets of the next board, once the one before has answered."""
-        data, self._follow_up = self._follow_up, b""
-        return data
 
     def _encode(self, differential: Sequence[float]) -> list[bytes]:
         """Return one frame a board; valves that have no chamber are told to vent."""

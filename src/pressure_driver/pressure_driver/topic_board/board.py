@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
-from pressure_driver.emulator.device import BoardCommand, BoardReading
+from pressure_driver.emulator.device import BoardReading
 from pressure_driver.emulator.firmware import NativeBoard
 from pressure_driver.settings import SettingError, TopicBoardSettings
 
@@ -65,15 +66,11 @@ class WatchedBoard:
         atmosphere: float,
         regulate: Callable[[Sequence[float]], None],
     ) -> None:
-        self._firmware = firmware
-        self._atmosphere = atmosphere
-        self._regulate = regulate
-        self._zero = (0.0,) * firmware.chamber_count
-        self._valid_until: float | None = None
-        self._sequence = 0
-        self._expired = False
-        self._vented = True
-        self._gauge: Sequence[float] = self._zero
+        self._firmware, self._regulate = firmware, regulate
+        count = firmware.chamber_count
+        self._zero = (0.0,) * count
+        self._reading = BoardReading(0.0, (atmosphere,) * count, atmosphere, self._zero, 0.0)
+        self._valid_until = math.inf
         self._measured_at = -math.inf
 
     def receive(self, data: bytes, now: float) -> bytes:
@@ -81,42 +78,30 @@ class WatchedBoard:
         answers = b""
         for command in self._firmware.decode(data):
             if command.kind in ("setpoint", "vent"):
-                self._execute(command, now)
+                self._valid_until = now + (command.valid_for or math.inf)
+                vented, number = command.kind == "vent", command.sequence or 0
+                self._reading = replace(
+                    self._reading, last_sequence=number, vented=vented, expired=False
+                )
+                self._regulate(command.pressure or self._zero)
             # An answer holds readings: old ones would pass for new ones.
             fresh = now - self._measured_at < STALE
             if fresh or command.kind in ("hello", "refused"):
-                answers += self._firmware.reply(command, self._reading(now))
+                answers += self._firmware.reply(command, replace(self._reading, time=now))
         return answers
-
-    def _execute(self, command: BoardCommand, now: float) -> None:
-        self._sequence = command.sequence or 0
-        self._expired, self._vented = False, command.kind == "vent"
-        valid_for = command.valid_for
-        self._valid_until = None if valid_for is None else now + valid_for
-        self._regulate(command.pressure or self._zero)
 
     def look(self, now: float) -> bytes:
         """Vent if the last setpoint is not valid any more; return what is to be said about it."""
-        if self._valid_until is None or now <= self._valid_until:
+        if now <= self._valid_until:
             return b""
-        self._valid_until = None
-        self._expired = self._vented = True
+        self._valid_until = math.inf
+        self._reading = replace(self._reading, vented=True, expired=True)
         self._regulate(self._zero)
         return self._firmware.expired()
 
     def measured(self, gauge: Sequence[float], now: float) -> bytes:
         """Take gauge pressures (2M,) [Pa]; return the report for the driver."""
-        self._gauge, self._measured_at = gauge, now
-        return self._firmware.telemetry(self._reading(now))
-
-    def _reading(self, now: float) -> BoardReading:
-        return BoardReading(
-            time=now,
-            chamber_pressure=tuple(self._atmosphere + p for p in self._gauge),
-            atmosphere=self._atmosphere,
-            valve_opening=self._zero,
-            supply_pressure=0.0,
-            last_sequence=self._sequence,
-            vented=self._vented,
-            expired=self._expired,
-        )
+        absolute = tuple(self._reading.atmosphere + pressure for pressure in gauge)
+        self._measured_at = now
+        self._reading = replace(self._reading, time=now, chamber_pressure=absolute)
+        return self._firmware.telemetry(self._reading)

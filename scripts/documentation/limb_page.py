@@ -1,7 +1,4 @@
-"""Write docs/reference/limb_parameters.md, the page of a limb's parameters, from its declaration.
-
-python3 scripts/write_limb_page.py
-"""
+"""The page of a limb's parameters, from their declaration."""
 
 from __future__ import annotations
 
@@ -19,14 +16,9 @@ from der_planner.limb import (
     declarations,
 )
 from der_planner.results.tables import Table
-from workspace_setup.basics import ROOT
 
-PAGE = ROOT / "docs" / "reference" / "limb_parameters.md"
 _HEAD = """\
 # The parameters of a limb
-
-Written by `python3 scripts/write_limb_page.py` from `parameters.py`, `limb.py` and `loads.py` in
-`src/der_planner/der_planner/limb`: change them there.
 
 All values are SI. A key without a default has to be in the limb file. "Fit" is the unknown by
 which the [calibration](../guide/identification.md) finds the value: its unit, its bounds, and ±
@@ -87,10 +79,3 @@ def _fit(term: Term | None) -> str:
     unit = "" if term.unit == "-" else f" {term.unit}"
     spread = f", ± {term.spread:g}" if term.spread < float("inf") else ""
     return f"{name} ({term.group}): {term.low:g} to {term.high:g}{unit}{spread}"
-
-
-def main() -> int:
-    """Write the page."""
-    PAGE.write_text(page(), encoding="utf-8")
-    print(f"wrote {PAGE}")
-    return 0

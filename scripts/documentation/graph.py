@@ -1,0 +1,119 @@
+"""What the running graph says of itself: the parameters and topics of each node, kept as JSON.
+
+python3 scripts/docs.py --graph starts the graph on the twin and writes docs/reference/graph.json; a
+test compares that file with the graph.
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters
+from rclpy.parameter import parameter_value_to_python
+
+from der_planner.experiment.client import GraphClient
+from der_planner.experiment.console import Progress
+from der_planner.experiment.graph_run import running_graph
+from der_planner.experiment.processes import GraphSetup, NodeProcess
+from limb_interfaces import topics
+from workspace_setup.basics import ROOT
+
+FILE = ROOT / "docs" / "reference" / "graph.json"
+OF_ROS = ("qos_overrides.", "start_type_description_service", "use_sim_time")
+"""Beginnings of the names of parameters that every node has."""
+BODIES = "pose_tracker"
+"""A node that is not part of the experiment on the twin."""
+OF_EVERY_NODE = ("/rosout", "/parameter_events")
+
+
+def text() -> str:
+    """Start the graph on the twin and return what it says of itself, as JSON."""
+    folder = Path(tempfile.mkdtemp(prefix="graph_"))
+    setup = GraphSetup(folder / "bag", {}, planner={}, page=0)
+    given = {item.executable: item.parameters for item in setup.nodes("")}
+    with GraphClient("reference") as client, running_graph(client, setup, folder, Progress()):
+        bodies = NodeProcess("apriltag_tracker", BODIES, {}, folder)
+        try:
+            found = {name: _node(client, name, given.get(name, {})) for name in [*given, BODIES]}
+        finally:
+            bodies.stop()
+    return json.dumps(found, indent=1, sort_keys=True) + "\n"
+
+
+def _node(client: GraphClient, name: str, given: dict[str, Any]) -> dict[str, Any]:
+    """Return one node's parameters and topics."""
+    node, space = client.node, f"/{topics.NAMESPACE}"
+    ends = {
+        "publishes": (
+            node.get_publisher_names_and_types_by_node,
+            node.get_publishers_info_by_topic,
+        ),
+        "subscribes": (
+            node.get_subscriber_names_and_types_by_node,
+            node.get_subscriptions_info_by_topic,
+        ),
+    }
+    found: dict[str, Any] = {"parameters": _parameters(client, name, given)}
+    for end, (listed, info) in ends.items():
+        # The recorder takes whatever there is.
+        pairs = [] if (name, end) == ("recorder", "subscribes") else listed(name, space)
+        found[end] = {
+            topic.removeprefix(space + "/"): [kinds[0], _quality(info(topic), name)]
+            for topic, kinds in pairs
+            if topic not in OF_EVERY_NODE and "/_" not in topic
+        }
+    services = node.get_service_names_and_types_by_node(name, space)
+    found["services"] = {
+        service.removeprefix(space + "/"): kinds[0]
+        for service, kinds in services
+        if not kinds[0].startswith(("rcl_interfaces/", "type_description_interfaces/"))
+        and "/_action/" not in service
+    }
+    return found
+
+
+def _quality(ends: list[Any], name: str) -> str:
+    """Return the quality of service of a node's end of a topic."""
+    profile = next(end.qos_profile for end in ends if end.node_name == name)
+    words = [profile.reliability.name.lower().replace("_", " ")]
+    if profile.durability.name == "TRANSIENT_LOCAL":
+        words.append("latched")
+    return ", ".join(words)
+
+
+def _parameters(client: GraphClient, name: str, given: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return name, default, range and description of each parameter, by their names."""
+    listed = _ask(client, name, "list_parameters", ListParameters, {}).result.names
+    names = sorted(item for item in listed if not item.startswith(OF_ROS))
+    described = _ask(client, name, "describe_parameters", DescribeParameters, {"names": names})
+    values = _ask(client, name, "get_parameters", GetParameters, {"names": names}).values
+    found = []
+    for item, value in zip(described.descriptors, values, strict=True):
+        limits = [*item.floating_point_range, *item.integer_range]
+        default = parameter_value_to_python(value)
+        if isinstance(default, str) and "/share/" in default:
+            default = default.partition("/share/")[2]
+        found.append(
+            {
+                "name": item.name,
+                "default": "" if item.name in given else default,
+                "range": [limits[0].from_value, limits[0].to_value] if limits else [],
+                "description": item.description,
+                "choices": item.additional_constraints.removeprefix("one of "),
+                "changeable": not item.read_only,
+            }
+        )
+    return found
+
+
+def _ask(client: GraphClient, name: str, service: str, kind: Any, request: dict[str, Any]) -> Any:
+    """Call one of a node's services for its parameters and return the response."""
+    asked = client.node.create_client(kind, f"{name}/{service}")
+    client.wait_for(asked.service_is_ready, 20.0, f"{name}/{service}")
+    future = asked.call_async(kind.Request(**request))
+    client.wait_for(future.done, 20.0, f"an answer of {name}/{service}")
+    client.node.destroy_client(asked)
+    return future.result()
