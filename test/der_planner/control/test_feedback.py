@@ -7,8 +7,8 @@ import pytest
 from link_chain import LinkChain
 
 from der_planner.control import Feedback, Learner
-from der_planner.control.feedback import Supervisor
 from der_planner.control.lockstep import Played, Sensors, play
+from der_planner.control.supervisor import Supervisor
 from der_planner.limb import Limb
 from der_planner.planning import Motion, Plan, plan
 from der_planner.planning.streaming import Schedule

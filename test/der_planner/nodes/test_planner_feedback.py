@@ -14,17 +14,59 @@ def test_pictures_from_the_future_are_left_out_and_named_once():
     from limb_interfaces.stamps import stamp_from_nanoseconds
 
     said = []
-    corrector = Corrector(None, said.append, lambda: 1_700_000_000_000_000_000)
+    now = 1_700_000_000_000_000_000
+    corrector = Corrector(None, said.append, lambda: now, lambda _: None)
     taken = []
     corrector._post = taken.append
     for ahead in (9, 30, 31):
         state = LimbState(valid=True, bend_angle=[0.1, 0.1])
-        state.header.stamp = stamp_from_nanoseconds(1_700_000_000_000_000_000 + ahead * 1_000_000)
+        state.header.stamp = stamp_from_nanoseconds(now + ahead * 1_000_000)
         corrector.add_state(state)
     corrector.close()
     assert len(taken) == 1
     (text,) = said
     assert "pictures come from 30 ms in the future" in text
+
+
+def test_a_touch_is_published_and_drawn_while_it_lasts():
+    from dataclasses import replace
+    from unittest.mock import Mock
+
+    from visualization_msgs.msg import Marker
+
+    from der_planner.control.touch import untouched
+    from der_planner.limb import Limb
+    from der_planner.nodes.planner_topics import PlannerPublishers
+    from der_planner.planning import Motion, plan
+    from der_planner.planning.streaming import Schedule
+    from limb_interfaces import topics
+    from limb_interfaces.stamps import nanoseconds, stamp_from_nanoseconds
+
+    sent = {}
+    node = Mock()
+    node.create_publisher = lambda _, topic, __: Mock(
+        publish=lambda message: sent.update({topic: message})
+    )
+    node.get_clock().now().to_msg.return_value = stamp_from_nanoseconds(0)
+    output = PlannerPublishers(node)
+    planned = plan(Limb.default(), Motion.named("same_direction", period=6.0), method="projected")
+    schedule = Schedule("touched", planned, 1_000_000_000)
+    nothing = untouched(2.0, np.zeros(2))
+    found = replace(
+        nothing, touched=True, since=1.5, place=0.1, force=np.array([0.0, 0.3]),
+        pressure=np.array([500.0, 0.0]), force_covariance=0.01 * np.eye(2), said="0.30 N",
+    )  # fmt: skip
+    output.contact(schedule, found)
+    told, (arrow,) = sent[topics.CONTACT], sent[topics.SHAPE_MARKERS].markers
+    assert (told.touched, told.said, told.arc_length) == (True, "0.30 N", 0.1)
+    assert nanoseconds(told.header.stamp) == 3_000_000_000
+    assert nanoseconds(told.since) == 2_500_000_000
+    assert told.point.x == pytest.approx(0.1)
+    assert arrow.action == Marker.ADD
+    np.testing.assert_allclose([arrow.points[0].x, arrow.points[0].y], [0.1, -0.03], atol=1e-6)
+    output.contact(schedule, nothing)
+    assert not sent[topics.CONTACT].touched
+    assert sent[topics.SHAPE_MARKERS].markers[0].action == Marker.DELETE
 
 
 def test_solutions_that_take_too_long_never_hold_up_the_plan():
@@ -55,6 +97,8 @@ def test_solutions_that_take_too_long_never_hold_up_the_plan():
         def estimate(self, *arguments, **about):
             pass
 
+        contact = estimate
+
     said, taken_back = [], threading.Event()
     now = [1_700_000_000_000_000_000]
 
@@ -66,7 +110,7 @@ def test_solutions_that_take_too_long_never_hold_up_the_plan():
     motion = Motion.named("same_direction", period=60.0, cycles=2)
     planned = plan(Limb.default(), motion, method="projected")
     slow = Slow(planned)
-    corrector = Corrector(Output(), warn, lambda: now[0])
+    corrector = Corrector(Output(), warn, lambda: now[0], lambda _: None)
     schedule = Schedule("slow", planned, now[0] - 1_000_000_000)
     corrector.follow(schedule, slow)
     assert slow.busy.wait(60.0)

@@ -44,7 +44,14 @@ def series(
     )
 
 
-OURS = ("LimbState", "PressurePlan", "PressureSetpoint", "PressureState", "ChamberPressures")
+OURS = (
+    "LimbState",
+    "LimbContact",
+    "PressurePlan",
+    "PressureSetpoint",
+    "PressureState",
+    "ChamberPressures",
+)
 
 
 class BagOfRun:
@@ -139,6 +146,11 @@ class BagOfRun:
             commanded_differential=np.asarray(commanded, dtype=float),
             measured_differential=np.asarray(measured, dtype=float),
         )
+
+    def touch(self, seconds: float, since: float, distance: float, said: str) -> None:
+        began = self.header(since).stamp
+        about = {"plan_id": "p", "touched": True, "since": began, "said": said}
+        self.write("/limb/contact", "LimbContact", seconds, distance=distance, **about)
 
     def command(self, seconds: float, differential, sequence: int) -> None:
         chambers = np.repeat(101_300.0, 4)

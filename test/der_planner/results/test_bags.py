@@ -139,9 +139,13 @@ def test_interrupted_run_says_so(tmp_path: Path):
     for when in FRAMES[FRAMES < 2.0]:
         bag.state(when, reference(when)[0])
     bag.pressure(1.5, [0, 0], [0, 0], mode=5, faults=["serial line lost"])
+    for when, distance, said in ((0.9, 2.0, "0.2 N"), (1.0, 9.0, "0.3 N"), (1.1, 4.0, "0.4 N")):
+        bag.touch(when, 0.8, distance, said)
     bag.bag.close()
     result = evaluate_run(load_run(tmp_path / "run"))
     assert any("serial line lost" in text for text in result.problems)
+    touched = [text for text in result.problems if "touched" in text]
+    assert touched == ["something touched the limb from 0.80 s on, 0.3 N"]
     assert any("not played" in text for text in result.problems)
 
 

@@ -26,6 +26,7 @@ SETPOINT_TYPE = "der_msgs/msg/PressureSetpoint"
 PRESSURE_TYPE = "der_msgs/msg/PressureState"
 STATE_TYPE = "der_msgs/msg/LimbState"
 ESTIMATE_TYPE = "der_msgs/msg/LimbEstimate"
+CONTACT_TYPE = "der_msgs/msg/LimbContact"
 DIAGNOSTICS_TYPE = "diagnostic_msgs/msg/DiagnosticArray"
 TRUTH_SUFFIX = "twin/ground_truth"
 BOARD_SUFFIX = "twin/board_commands"
@@ -118,6 +119,7 @@ class LimbRecord:
         truth: simulated tip [m] (twin only).
         commanded, measured: differential pressures [Pa].
         faults: reasons of the driver with their stamps [ns].
+        touches: by plan id and when one began [ns]: how far it was from a free limb, what it said.
         board: commands as the board received them [Pa] (twin only).
         ahead: by which a state or pressure is stamped later than it arrived, at the most [ns].
     """
@@ -132,6 +134,7 @@ class LimbRecord:
     commanded: Columns = field(default_factory=Columns)
     measured: Columns = field(default_factory=Columns)
     faults: list[tuple[int, str]] = field(default_factory=list)
+    touches: dict[tuple[str, int], tuple[float, str]] = field(default_factory=dict)
     board: Columns = field(default_factory=Columns)
     ahead: int = 0
 
@@ -163,6 +166,12 @@ class LimbRecord:
         """Add a `LimbEstimate`."""
         picture = header_stamp(message) - round(message.age * NANOSECONDS)
         self.revisions[message.plan_id].estimated(picture, np.asarray(message.correction))
+
+    def add_contact(self, message: Any) -> None:
+        """Add a `LimbContact`: of each touch the one that was surest."""
+        name = message.plan_id, nanoseconds_of(message.since)
+        if message.touched and message.distance > self.touches.get(name, (0.0, ""))[0]:
+            self.touches[name] = float(message.distance), message.said
 
     def add_state(self, message: Any) -> None:
         """Add a `LimbState` of the tracker."""
@@ -261,7 +270,12 @@ def namespace_of(topic: str) -> str:
 
 def header_stamp(message: Any) -> int:
     """Return the stamp of a recorded message [ns]."""
-    return int(message.header.stamp.sec) * NANOSECONDS + int(message.header.stamp.nanosec)
+    return nanoseconds_of(message.header.stamp)
+
+
+def nanoseconds_of(stamp: Any) -> int:
+    """Return a recorded stamp [ns]."""
+    return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
 
 
 def _collect(bag: BagReader) -> tuple[dict[str, LimbRecord], str]:
@@ -310,6 +324,7 @@ def _method(topic: str, type_name: str) -> Callable[[LimbRecord, Any], None] | N
         PRESSURE_TYPE: LimbRecord.add_pressure,
         STATE_TYPE: LimbRecord.add_state,
         ESTIMATE_TYPE: LimbRecord.add_estimate,
+        CONTACT_TYPE: LimbRecord.add_contact,
     }.get(type_name)
 
 

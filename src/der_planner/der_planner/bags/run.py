@@ -124,6 +124,7 @@ class RunSeries:
         truth: simulated tip (T, 2) [m]; only in bags of the twin.
         board: only in bags of the twin.
         faults: reasons that the driver gave during the motion.
+        touches: what feedback said of what touched the limb, a sentence each.
         finished: the motion was played to its last setpoint.
         origin: ROS time of the first setpoint [ns]; 0 for a run without a bag.
         ahead: by which a stamp was later than the arrival of its message, at the most [s].
@@ -141,6 +142,7 @@ class RunSeries:
     truth: Stream | None = None
     board: BoardLog | None = None
     faults: tuple[str, ...] = ()
+    touches: tuple[str, ...] = ()
     finished: bool = True
     origin: int = 0
     ahead: float = 0.0

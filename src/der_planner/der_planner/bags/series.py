@@ -121,6 +121,11 @@ def run_of(record: BagRecord, namespace: str, plan_id: str = "") -> RunSeries:
         truth=stream(limb.truth, 2, origin) if len(limb.truth) else None,
         board=_board(limb, setpoints, origin),
         faults=tuple(dict.fromkeys(faults)),
+        touches=tuple(
+            f"from {(since - origin) / NANOSECONDS:.2f} s on, {said}"
+            for (name, since), (_, said) in limb.touches.items()
+            if name == chosen
+        ),
         finished=played == len(times) - 1 and tip.time[-1] >= end - 1.0,
         origin=origin,
         ahead=limb.ahead / NANOSECONDS,

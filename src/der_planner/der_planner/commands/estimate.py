@@ -5,7 +5,8 @@
 Any bag of a plan will do, played with feedback or without. The estimator of feedback goes over all
 pictures and pressures of the run, forward and backward. The table (CSV) has a row every 50 ms: bend
 angles and rates, tip, and per segment the effective pressure that the model lacks and the relative
-error of its gain, each with its standard deviation. Exit code 0: written; 2: a file cannot be used.
+error of its gain, each with its standard deviation. `--contact` tells what touched the limb: when,
+where and with what force. Exit code 0: written; 2: a file cannot be used.
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ import numpy as np
 
 from der_planner.arrays import Array
 from der_planner.commands.learn import FAILURES, add_plan_options, check_same, plan_of
-from der_planner.control.hindsight import Filmed, Smoothed, smooth
+from der_planner.control.hindsight import Filmed, Smoothed, smooth, touches
+from der_planner.control.touch import Touch
 from der_planner.experiment.console import check_file, command_parser, run_command
 from der_planner.planning import Plan
 from der_planner.results import EvaluationError, RunSeries, load_run
@@ -29,6 +31,7 @@ def main() -> int:
     parser = command_parser(__doc__)
     parser.add_argument("bag", type=Path, metavar="BAG", help="of a run")
     parser.add_argument("--out", type=Path, metavar="FILE", help="table (CSV) to write")
+    parser.add_argument("--contact", action="store_true", help="tell what touched the limb")
     add_plan_options(parser)
     given = parser.parse_args()
     return run_command(lambda: _estimate(given), *FAILURES, code=2)
@@ -38,12 +41,24 @@ def _estimate(given: argparse.Namespace) -> int:
     if given.out is not None:
         check_file(given.out)
     run = load_run(given.bag, namespace=given.namespace)
-    smoothed = estimate_run(plan_of(run, given), run)
+    planned = plan_of(run, given)
+    smoothed = estimate_run(planned, run)
     print("\n".join(_said(smoothed, run)))
+    if given.contact:
+        print("\n".join(_touched(touches(*_filmed(planned, run)))))
     if given.out is not None:
         write_table(smoothed, given.out)
         print(given.out)
     return 0
+
+
+def _filmed(planned: Plan, run: RunSeries) -> tuple[Plan, Filmed]:
+    """Return the plan as it was played, and what camera and board showed of the run."""
+    check_same(planned, run)
+    played = dataclasses.replace(planned, differential_pressure=run.setpoints.value)
+    return played, Filmed(
+        run.measured.time, run.measured.value, run.tip.time, run.bend_angle.value, run.tip.value
+    )
 
 
 def estimate_run(planned: Plan, run: RunSeries) -> Smoothed:
@@ -57,13 +72,8 @@ def estimate_run(planned: Plan, run: RunSeries) -> Smoothed:
         LearningError: the run is of another motion.
         EvaluationError: it holds no pictures or no measured pressures.
     """
-    check_same(planned, run)
-    played = dataclasses.replace(planned, differential_pressure=run.setpoints.value)
-    filmed = Filmed(
-        run.measured.time, run.measured.value, run.tip.time, run.bend_angle.value, run.tip.value
-    )
     try:
-        return smooth(played, filmed)
+        return smooth(*_filmed(planned, run))
     except ValueError as error:
         raise EvaluationError(f"{run.description.title}: {error}") from error
 
@@ -86,6 +96,15 @@ def _said(smoothed: Smoothed, run: RunSeries) -> list[str]:
         told = smoothed.consistency(run.truth.time, run.truth.value)
         lines.append(f"true tip against the estimate: {told:.2f} of the variance")
     return lines
+
+
+def _touched(found: list[Touch]) -> list[str]:
+    """Return what touched the limb, a line each."""
+    lines = [
+        f"touched from {each.since:.2f} s on, surest at {each.time:.2f} s: {each.said}"
+        for each in found
+    ]
+    return lines or ["nothing touched the limb"]
 
 
 def write_table(smoothed: Smoothed, path: Path) -> None:

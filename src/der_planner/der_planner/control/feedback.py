@@ -9,18 +9,11 @@
 All times are seconds since the plan's first setpoint. Nothing here knows the present: a command is
 based on what was told before it was asked for.
 
-A `Supervisor` decides on the share of the corrections that is sent. It goes from 0 to 1 once the
-limb is seen, and back to 0, which is the plan alone, where feedback can do harm: the camera sees
-nothing, or what it sees does not fit the model; corrections swing, or stay at what they are
-allowed, and the tip is far from its path; commands are asked for too late. Lost tags may come back;
-after the other reasons the rest of the run is played without feedback.
+A `Supervisor` decides on the share of the corrections that is sent; what is done where something
+touches the limb is a `Reaction`.
 """
 
 from __future__ import annotations
-
-import math
-from collections import deque
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -31,193 +24,21 @@ from der_planner.control.estimation import Estimator
 from der_planner.control.horizon import Horizon
 from der_planner.control.knowledge import Estimate
 from der_planner.control.nominal import ChamberLog, Nominal
+from der_planner.control.reaction import Kind, Reaction
+from der_planner.control.supervisor import Supervisor, Warned
+from der_planner.control.touch import Touch, TouchSense
 from der_planner.limb.plausible import TOO_SMALL, impossible
-from der_planner.model import CONTROL_PERIOD
+from der_planner.model import CONTROL_PERIOD, STEPS
 from der_planner.model.commands import within_limits
 from der_planner.planning.plan_file import Plan
 
 _THREADS = ThreadpoolController()
-REASONS = {
-    "tags lost": "the limb has not been seen for {:.1f} s",
-    "inconsistent": "the limb moves as the model cannot, measurements are {:.0f} times too far off",
-    "oscillation": "corrections swing by {:.0f} Pa, and neither they nor the limb come to rest",
-    "saturation": "a correction is at its limit of {:.0f} Pa, and the tip far from its path",
-    "late": "commands come {:.2f} s after their instant",
-    "pressures": "chambers are said to hold {:.3g} Pa, which no command has made: are pressures "
-    "told in Pa, and is the supply open?",
-}
-"""Every reason with the sentence of its warning."""
-_GOES_ON = 0.7
-"""Share of its largest swing below which something that swings begins or dies out."""
-
-
 _AUTHORITY = 0.4
 """Largest correction, as a share of the limb's pressure limit."""
-_RAMP = 1.0
-"""Time in which feedback comes in [s]."""
-_FADE = 1.5
-"""Time in which feedback is taken back [s]."""
-_BLIND = 0.5
-"""Time without a measurement after which the tags are lost [s]."""
-_KEPT = 1.0
-"""Time after that in which the last disturbances are still made up for [s]."""
-_INCONSISTENT = 20.0
-"""Squared distance of measurements per coordinate, smoothed, that is too large; 1 is expected."""
-_PATIENCE = 2.0
-"""Time for which measurements may be inconsistent [s]."""
-_SATURATED = 3.0
-"""Time for which a correction may be at its limit [s]."""
-_ASTRAY = 0.03
-"""Distance of the tip from r̄, over the limb's length, up to which neither a correction at its limit
-nor one that swings ends feedback: a limb that follows is not left to a plan that may be worse."""
-_SWING = 0.1
-"""Way from one turn of a swinging correction to the next, as a share of the authority."""
-_TURNS = 6
-"""Number of turns within the window that are an oscillation, unless it begins or dies out."""
-_WINDOW = 4.0
-"""Time in which the turns are counted [s]."""
+_SOON = 10
+"""Coming commands that may be played before the next ones are known, and must keep off a touch."""
 _FILLED = 0.1
 """Command from which on chambers must hold something, as a share of the limb's pressure limit."""
-_STRANGE = 1.5
-"""Time for which chambers may be said to hold what no command has made [s]."""
-_LATE = 4.0
-"""Number of commands that may come too late; one in time makes up for half of one."""
-
-
-@dataclass(frozen=True)
-class Warned:
-    """A reason for which feedback was taken back.
-
-    Attributes:
-        time: [s] of the plan.
-        name: one of `REASONS`.
-        message: a sentence with its number.
-    """
-
-    time: float
-    name: str
-    message: str
-
-
-class Supervisor:
-    """Decides on the share of the corrections that is sent; see the module.
-
-    Args:
-        authority: largest correction [Pa].
-        length: of the limb [m].
-
-    Attributes:
-        share: 0 … 1.
-        reason: for which feedback is out or going out; empty while it acts.
-        warnings: all that were given.
-    """
-
-    def __init__(self, authority: float, length: float) -> None:
-        self.authority, self.length = authority, length
-        self.share = 0.0
-        self.reason = ""
-        self.warnings: list[Warned] = []
-        self._latched = False
-        self._since: dict[str, float] = {}
-        self._late = 0.0
-        self._astray_at = -math.inf
-        self._recent: deque[tuple[Array, float]] = deque(maxlen=round(_WINDOW / CONTROL_PERIOD))
-
-    def advance(self, time: float, age: float, strange: float) -> float:
-        """Return the share of a command's correction.
-
-        Args:
-            time: instant of the command [s].
-            age: of the newest measurement then [s].
-            strange: squared distance of measurements per coordinate, smoothed.
-        """
-        if self._lasts("strange", strange > _INCONSISTENT, time) > _PATIENCE:
-            self.stop(time, "inconsistent", strange)
-        seen = age <= _BLIND
-        if not seen and not self._latched and self.share > 0.0:
-            self._warn(time, "tags lost", age)
-        if seen and self.reason == "tags lost":
-            self.reason = ""
-        if self._latched or age > _BLIND + _KEPT:
-            self.share = max(0.0, self.share - CONTROL_PERIOD / _FADE)
-        elif seen:
-            self.share = min(1.0, self.share + CONTROL_PERIOD / _RAMP)
-        return self.share
-
-    def sent(self, time: float, correction: Array, swing: float, missed: float = math.inf) -> None:
-        """Look at a correction that is sent.
-
-        Args:
-            time: instant of the command [s].
-            correction: (M,) [Pa].
-            swing: rate at which the limb deviates from the model's motion then [rad/s].
-            missed: distance of the tip from r̄ then [m]; if nobody tells, it is far.
-        """
-        astray = missed > _ASTRAY * self.length
-        if astray:
-            self._astray_at = time
-        limited = np.abs(correction).max() > 0.98 * self.authority * self.share
-        in_vain = bool(self.share > 0.0 and limited and astray)
-        if self._lasts("in vain", in_vain, time) > _SATURATED:
-            self.stop(time, "saturation", self.authority)
-        self._recent.append((correction, swing))
-        distance = self._oscillation()
-        if distance > 0.0 and time - self._astray_at <= _WINDOW:
-            self.stop(time, "oscillation", distance)
-
-    def held(self, time: float, pressure: float, possible: bool) -> None:
-        """Look at what chambers are said to hold [Pa], and whether commands can have made it."""
-        if self._lasts("pressures", not possible, time) > _STRANGE:
-            self.stop(time, "pressures", pressure)
-
-    def _lasts(self, what: str, now: bool, time: float) -> float:
-        """Return for how long something has been so at an instant, without a break [s]."""
-        if not now:
-            self._since.pop(what, None)
-            return 0.0
-        return time - self._since.setdefault(what, time)
-
-    def _oscillation(self) -> float:
-        """Return how far a correction swings [Pa] if it and the limb swing on and on; else 0.
-
-        After a push they swing more than before, and later less. A correction that is cut at its
-        limit swings as far as before while the limb's swing dies out.
-        """
-        if len(self._recent) < (self._recent.maxlen or 0):
-            return 0.0
-        corrections, swings = (np.array(each) for each in zip(*self._recent, strict=True))
-        third, least = len(swings) // 3, _SWING * self.authority
-        if min(swings[:third].max(), swings[-third:].max()) < _GOES_ON * swings.max():
-            return 0.0
-        for series in corrections.T:
-            distance = float(np.ptp(series))
-            away = series - (series.max() + series.min()) / 2
-            sides = np.sign(away[np.abs(away) > least / 2])
-            goes_on = min(np.ptp(series[:third]), np.ptp(series[-third:])) >= _GOES_ON * distance
-            if goes_on and np.count_nonzero(np.diff(sides)) >= _TURNS:
-                return distance
-        return 0.0
-
-    def late(self, time: float, by: float) -> None:
-        """Note that a command came after its instant [s], and by how much [s]."""
-        self._late += 1.0
-        if self._late >= _LATE:
-            self.stop(time, "late", by)
-
-    def in_time(self) -> None:
-        """Note that a command is in time; it makes up for half a late one."""
-        self._late = max(0.0, self._late - 0.5)
-
-    def stop(self, time: float, name: str, number: float) -> None:
-        """Play the rest without feedback, for one of `REASONS` and the number in its sentence."""
-        if not self._latched:
-            self._latched = True
-            self._warn(time, name, number)
-
-    def _warn(self, time: float, name: str, number: float) -> None:
-        if self.reason != name:
-            self.reason = name
-            self.warnings.append(Warned(time, name, REASONS[name].format(number)))
 
 
 class Feedback:
@@ -227,12 +48,16 @@ class Feedback:
 
     Args:
         plan: what is played; its limb, reference and commands are used.
+        reaction: to something that touches the limb: "warn", "hold", "yield" or "vent".
+        force_limit: force that is allowed then, with "yield" [N]; None: none more than there is.
 
     Attributes:
         plan: as given.
     """
 
-    def __init__(self, plan: Plan) -> None:
+    def __init__(
+        self, plan: Plan, reaction: Kind = "warn", force_limit: float | None = None
+    ) -> None:
         self.plan = plan
         authority = _AUTHORITY * plan.limb.pneumatics.pressure_limit
         length = sum(segment.length for segment in plan.limb.segments)
@@ -242,6 +67,8 @@ class Feedback:
             self._chambers = ChamberLog(self._nominal)
             self._estimator = Estimator(self._nominal, self._chambers)
             self._horizon = Horizon(self._nominal, self._chambers, authority)
+            self._sense = TouchSense(self._nominal.model)
+            self._reaction = Reaction(self._nominal.model, reaction, force_limit)
             self._horizon.warm_up(self._estimator.beginning(0))
 
     @property
@@ -258,6 +85,16 @@ class Feedback:
     def share(self) -> float:
         """Share of the corrections that is sent, 0 … 1."""
         return self._supervisor.share
+
+    @property
+    def touch(self) -> Touch:
+        """What is known of something that touches the limb, at the newest picture."""
+        return self._sense.newest
+
+    @property
+    def vents(self) -> bool:
+        """Whether something touches the limb, for which it is to be vented."""
+        return self._reaction.vents
 
     @property
     def innovations(self) -> list[tuple[float, float, int]]:
@@ -277,6 +114,7 @@ class Feedback:
         self._chambers.take_over(other._chambers, round(time / CONTROL_PERIOD))
         with _THREADS.limit(limits=1, user_api="blas"):
             self._estimator.take_over(other._estimator, time)
+        self._sense.free = other._sense.free
         # What ended the other's feedback does not count here.
         self._supervisor.share = other.share
 
@@ -335,6 +173,7 @@ class Feedback:
             # Matrices of some ten rows: more threads only get into other processes' way.
             with _THREADS.limit(limits=1, user_api="blas"):
                 known = self._estimator.at(instant)
+                self._feel()
                 age = instant - self._estimator.newest
                 swing = float(np.linalg.norm(known.parts[1]))
                 missed = self._estimator.missed(known, k)
@@ -347,13 +186,23 @@ class Feedback:
             supervisor.stop(instant, "inconsistent", np.inf)
             correction = np.zeros_like(planned)
         air = self._nominal.model.air
-        command: Array = within_limits((planned + correction)[None], air, CONTROL_PERIOD, before)[
-            0
-        ][0]
+        chambers = self._chambers.during(np.array([k * STEPS - 1]))[0]
+        self._reaction.follow(planned, self.touch, chambers)
+        wanted = self._reaction.allowed(planned + correction)
+        command: Array = within_limits(wanted[None], air, CONTROL_PERIOD, before)[0][0]
+        if self.touch.touched and self._reaction.acts:
+            missed = 0.0  # What is in the way keeps the tip away.
         supervisor.sent(instant, command - planned, swing, missed)
         self._chambers.send(k, command)
         self._estimator.changed(instant)
         return command
+
+    def _feel(self) -> None:
+        """Look at what the newest picture says of a touch."""
+        time = self._estimator.newest
+        if np.isfinite(time) and time > self._sense.newest.time:
+            known = self._estimator.at(time)
+            self._sense.feel(time, self._nominal.at(time)[0] + known.parts[0], known)
 
     def coming(self) -> tuple[int, Array]:
         """Return the control period of the newest command, and corrections (W, M) [Pa] from it on.
@@ -361,7 +210,12 @@ class Feedback:
         Those after the first are what would follow if nothing new were seen.
         """
         first, corrections = self._horizon.solution
-        return first, self._supervisor.share * corrections
+        corrections = self._supervisor.share * corrections
+        if self.touch.touched and self._reaction.acts:
+            planned = self._nominal.commands[self._nominal.periods(first + np.arange(_SOON))]
+            for ahead, each in enumerate(planned):
+                corrections[ahead] = self._reaction.allowed(each + corrections[ahead]) - each
+        return first, corrections
 
     def sent(self, time: float, command: ArrayLike) -> None:
         """Tell that another command (M,) [Pa] was sent for an instant [s] than was asked for."""

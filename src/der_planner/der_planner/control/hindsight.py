@@ -14,6 +14,7 @@ from der_planner.arrays import Array, interpolate
 from der_planner.control.estimation import Estimator
 from der_planner.control.knowledge import EstimatorSettings
 from der_planner.control.nominal import STEP, ChamberLog, Nominal
+from der_planner.control.touch import Touch, TouchSense
 from der_planner.model import CONTROL_PERIOD, STEPS
 from der_planner.planning.plan_file import Plan
 
@@ -99,9 +100,36 @@ def smooth(plan: Plan, filmed: Filmed) -> Smoothed:
     Raises:
         ValueError: no pictures or no measured pressures, or of another limb.
     """
+    return _backward(*_forward(plan, filmed, _SLOW))
+
+
+def touches(plan: Plan, filmed: Filmed) -> list[Touch]:
+    """Return what touched the limb in a recorded run, each as it was when it was surest.
+
+    Args:
+        plan: what was played: limb, commands and reference.
+        filmed: of the run.
+
+    Raises:
+        ValueError: no pictures or no measured pressures, or of another limb.
+    """
+    estimator, last = _forward(plan, filmed, EstimatorSettings())
+    nominal, found = estimator.nominal, dict[float, Touch]()
+    sense = TouchSense(nominal.model)
+    for j, known in enumerate(estimator.between(0, last)[1]):
+        if j % STEPS == 0:
+            touch = sense.feel(j * STEP, nominal.at(j * STEP)[0] + known.parts[0], known)
+            best = found.get(touch.since)
+            if touch.touched and (best is None or touch.distance > best.distance):
+                found[touch.since] = touch
+    return list(found.values())
+
+
+def _forward(plan: Plan, filmed: Filmed, settings: EstimatorSettings) -> tuple[Estimator, int]:
+    """Return an estimator that has seen a whole run, and its last fine step."""
     nominal = Nominal(plan)
     chambers = ChamberLog(nominal, kept=_WHOLE)
-    estimator = Estimator(nominal, chambers, _SLOW, history=_WHOLE)
+    estimator = Estimator(nominal, chambers, settings, history=_WHOLE)
     for time, pressures in zip(filmed.pressure_time, filmed.differential_pressure, strict=True):
         chambers.read(float(time), pressures)
     seen = np.isfinite(filmed.tip).all(axis=1) & (filmed.picture_time > -_BEFORE)
@@ -113,7 +141,7 @@ def smooth(plan: Plan, filmed: Filmed) -> Smoothed:
         estimator.measure(float(time), bend, tip, None)
     last = round(min(float(pictures[0][-1]), float(plan.time[-1])) / STEP)
     estimator.at(last * STEP)
-    return _backward(estimator, last)
+    return estimator, last
 
 
 def _backward(estimator: Estimator, last: int) -> Smoothed:

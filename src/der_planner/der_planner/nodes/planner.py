@@ -60,7 +60,8 @@ class PlannerNode(Node):
         self._streamer = Streamer(
             self._now, self._send, self._ended, self._driver.obstacle, self._options.lead
         )
-        self._corrector = Corrector(self._output, self.get_logger().warning, self._now)
+        vent = self.create_client(Trigger, "pressure_driver/vent").call_async
+        self._corrector = Corrector(self._output, self.get_logger().warning, self._now, vent)
         self._action = MotionAction(
             self, self._checked, self._accept, self._stop_plan, self._streamer.find
         )
@@ -140,7 +141,7 @@ class PlannerNode(Node):
             response.message = obstacle.reason
         else:
             plan_id, result, corrected = newest
-            feedback = Feedback(result) if corrected else None
+            feedback = self._options.corrected(result) if corrected else None
             schedule = self._play(self._streamer.unspent(plan_id), result, 0, feedback)
             response.success = True
             response.message = (
@@ -238,7 +239,7 @@ class PlannerNode(Node):
             raise Cancelled
         self._status = Status("planning", request.plan_id)
         stamp, result = self._make(request)
-        feedback = Feedback(result) if request.feedback else None
+        feedback = self._options.corrected(result) if request.feedback else None
         if feedback is not None:
             result = dataclasses.replace(result, method=f"{result.method} + feedback")
         for warning in result.warnings:
@@ -280,6 +281,7 @@ class PlannerNode(Node):
                 result = plan(
                     request.limb, request.motion, request.model, request.method,
                     nodes=self._options.nodes, start=start, progress=progress,
+                    obstacles=self._options.obstacles,
                 )  # fmt: skip
             elif start is not None:
                 raise ValueError("a learned plan begins at rest: send it after this motion")

@@ -7,12 +7,14 @@ stamp, with the newest corrections there are for it; it never waits for this thr
 
 from __future__ import annotations
 
+import math
 import threading
 import time as clock
 from collections import deque
 from collections.abc import Callable
 
 import numpy as np
+from std_srvs.srv import Trigger
 
 from der_msgs.msg import LimbState, PressureState
 from der_planner.arrays import Array
@@ -55,6 +57,8 @@ class _Corrected:
         self.coming: tuple[int, Array] = feedback.coming()
         self.revisions: dict[int, int] = {}
         self.warned = 0
+        self.touched = self.felt = -math.inf
+        self.vented = False
 
     def time_of(self, stamp: int) -> float:
         """Return an instant [ns] in the plan's seconds."""
@@ -108,12 +112,17 @@ class Corrector:
         output: publishes revised setpoints and estimates.
         warn: says that feedback was taken back.
         now: present ROS time [ns].
+        vent: asks the driver to vent the limb, where a touch asks for it.
     """
 
     def __init__(
-        self, output: PlannerPublishers, warn: Callable[[str], None], now: Callable[[], int]
+        self,
+        output: PlannerPublishers,
+        warn: Callable[[str], None],
+        now: Callable[[], int],
+        vent: Callable[[Trigger.Request], object],
     ) -> None:
-        self._output, self._warn, self._now = output, warn, now
+        self._output, self._warn, self._now, self._vent = output, warn, now, vent
         self._wake = threading.Condition()
         self._inbox: deque[Callable[[_Corrected], None]] = deque(maxlen=200)
         self._open: list[_Corrected] = []
@@ -254,12 +263,27 @@ class Corrector:
             text = f"plan {schedule.plan_id}, {warned.time:.2f} s: feedback is taken back, "
             self._warn(f"{text}{warned.name}: {warned.message}")
         each.warned = len(feedback.warnings)
+        self._react(each)
         instant = max(now, schedule.start)
         estimate = feedback.estimate(each.time_of(instant))
         self._output.estimate(
             schedule, instant, estimate, correction=(pressures - planned).tolist(),
             share=feedback.share, reason=feedback.reason, solve_time=took,
         )  # fmt: skip
+
+    def _react(self, each: _Corrected) -> None:
+        """Say that something touches the limb, once for each touch, and vent it if that is set."""
+        touch = each.feedback.touch
+        if touch.time > each.felt:
+            each.felt = touch.time
+            self._output.contact(each.schedule, touch)
+        if touch.touched and touch.since > each.touched:
+            each.touched = touch.since
+            text = f"plan {each.schedule.plan_id}, {touch.since:.2f} s: something touches the limb"
+            self._warn(f"{text}: {touch.said}")
+        if each.feedback.vents and not each.vented:
+            each.vented = True
+            self._vent(Trigger.Request())
 
     def _replaced(self, each: _Corrected, index: int) -> bool:
         """Tell whether another schedule has taken over by a setpoint's instant."""

@@ -21,9 +21,11 @@ from rclpy.node import Node
 from der_msgs.action import PlayMotion
 from der_msgs.msg import LimbState, MotionCommand
 from der_planner.arrays import Array
+from der_planner.control.feedback import Feedback
+from der_planner.control.reaction import KINDS, Kind
 from der_planner.limb import HEAVIEST, Limb
 from der_planner.methods import LEARNED
-from der_planner.planning import METHODS, Motion, PathLimits, choose_method
+from der_planner.planning import METHODS, Motion, Obstacles, PathLimits, choose_method
 from der_planner.planning.motions import DEFAULT_AMPLITUDE, DEFAULT_CYCLES, DEFAULT_PERIOD
 from der_planner.planning.plan_file import Plan, learned_plan
 from der_planner.planning.streaming import GRID, Schedule
@@ -60,6 +62,13 @@ class PlannerOptions:
     driver_timeout: float
     learned_plans: str
     feedback: bool
+    reaction: Kind
+    force_limit: float
+    obstacles: Obstacles | None
+
+    def corrected(self, planned: Plan) -> Feedback:
+        """Return feedback on a plan, with the reaction to a touch that is set."""
+        return Feedback(planned, self.reaction, self.force_limit or None)
 
     def as_now(self, node: Node) -> PlannerOptions:
         """Return the parameters with what may be changed while the node runs as it is now."""
@@ -74,6 +83,7 @@ def read_parameters(node: Node) -> PlannerOptions:
     Raises:
         ParameterError: a value is out of range; names it.
         LimbError: the limb file cannot be used.
+        PlanningError: the file of obstacles cannot be used.
     """
     read: Any = functools.partial(declare, node)
     limb_file = read("limb_file", "", "limb file (YAML); empty: the default limb")
@@ -81,6 +91,10 @@ def read_parameters(node: Node) -> PlannerOptions:
     mounting = read(
         "mounting", "", "horizontal, hanging, standing, sideways or degrees of tilt; empty: "
         "gravity as in the limb file"
+    )  # fmt: skip
+    in_the_way = read(
+        "obstacles", "", "file (YAML) of what is in the limb's way: a motion that would run into "
+        "it is refused; empty: nothing"
     )  # fmt: skip
     learned_plans = read(
         "learned_plans", "", "folder of learned plans: a command of the method 'learned' names one "
@@ -136,6 +150,15 @@ def read_parameters(node: Node) -> PlannerOptions:
             "feedback", False, "correct plans of the rod while they are played, where a command "
             "does not ask for it"
         ),
+        reaction=read(
+            "reaction", "warn", "what feedback does where something touches the limb",
+            choices=KINDS
+        ),
+        force_limit=read(
+            "force_limit", 0.0, "force [N] that the reaction 'yield' allows; 0: none more than "
+            "there is when the touch is noticed", at_least=0.0, at_most=100.0
+        ),
+        obstacles=Obstacles.from_yaml(in_the_way) if in_the_way else None,
     )  # fmt: skip
 
 

@@ -2,29 +2,40 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from geometry_msgs.msg import Point, PointStamped
+from geometry_msgs.msg import Point, PointStamped, Vector3
 from rclpy.node import Node
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
-from der_msgs.msg import LimbEstimate, PressurePlan, PressureSetpoint, PressureState
-from der_planner.arrays import Array
+from der_msgs.msg import (
+    LimbContact,
+    LimbEstimate,
+    PressurePlan,
+    PressureSetpoint,
+    PressureState,
+)
+from der_planner.arrays import Array, interpolate
 from der_planner.control.knowledge import Estimate
+from der_planner.control.touch import Touch
 from der_planner.planning import Plan
 from der_planner.planning.streaming import GRID, Ending, Schedule
 from limb_interfaces import qos, topics
 from limb_interfaces.diagnostics import Health
-from limb_interfaces.stamps import stamp_from_nanoseconds
+from limb_interfaces.stamps import NANOSECONDS, stamp_from_nanoseconds
 
 REFERENCE = ColorRGBA(r=0.1, g=0.6, b=0.2, a=1.0)
 PREDICTED = ColorRGBA(r=0.9, g=0.5, b=0.1, a=1.0)
 ESTIMATED = ColorRGBA(r=0.1, g=0.4, b=0.9, a=0.7)
 LIMB = ColorRGBA(r=0.1, g=0.6, b=0.2, a=0.5)
+TOUCH = ColorRGBA(r=0.9, g=0.1, b=0.1, a=1.0)
+_METRES_PER_NEWTON = 0.1
+"""Length of the arrow that is drawn for a force."""
 
 
 # What is published -------------------------------------------------------------------------------
@@ -42,6 +53,7 @@ class PlannerPublishers:
         self._references = node.create_publisher(PointStamped, topics.TIP_REFERENCE, qos.STATES)
         self._markers = node.create_publisher(MarkerArray, topics.SHAPE_MARKERS, qos.STATES)
         self._estimates = node.create_publisher(LimbEstimate, topics.ESTIMATE, qos.STATES)
+        self._contacts = node.create_publisher(LimbContact, topics.CONTACT, qos.STATES)
 
     def plan(self, schedule: Schedule) -> None:
         """Publish a whole plan, stamped with its first setpoint, and both its tip paths."""
@@ -106,6 +118,37 @@ class PlannerPublishers:
             )
         )  # fmt: skip
         self._draw(self._line("estimate", curve, ESTIMATED, 0.004))
+
+    def contact(self, schedule: Schedule, touch: Touch) -> None:
+        """Publish what touches the limb, and draw its force where both can be told.
+
+        Args:
+            schedule: that is played.
+            touch: as it is known at the newest picture.
+        """
+        told = LimbContact(
+            header=_header(schedule.start + round(touch.time * NANOSECONDS)),
+            plan_id=schedule.plan_id, touched=touch.touched, distance=touch.distance,
+            arc_length=touch.place, arc_length_sigma=touch.place_deviation,
+            force_covariance=touch.force_covariance.ravel(), pressure=touch.pressure.tolist(),
+            said=touch.said,
+        )  # fmt: skip
+        told.force = Vector3(x=float(touch.force[0]), y=float(touch.force[1]))
+        told.point = Point(x=math.nan, y=math.nan)
+        arrow = self._line("contact", np.empty((0, 2)), TOUCH, 0.002)
+        arrow.type, arrow.action = Marker.ARROW, Marker.DELETE
+        if touch.touched:
+            told.since = stamp_from_nanoseconds(schedule.start + round(touch.since * NANOSECONDS))
+            curve = schedule.plan.body.kinematics.curve(touch.bend_angles)
+            along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1)))
+            ends = interpolate(np.full(1, touch.place), along, curve)
+            ends = np.concatenate([ends - _METRES_PER_NEWTON * touch.force, ends])
+            told.point = _points(ends)[1]
+            if np.isfinite(ends).all():
+                arrow.action, arrow.points = Marker.ADD, _points(ends)
+                arrow.scale.y = 2.0 * arrow.scale.x
+        self._contacts.publish(told)
+        self._draw(arrow)
 
     def reference_limb(self, schedule: Schedule, index: int, lead: int) -> None:
         """Draw the reference limb as it should be now, ``lead`` [ns] before setpoint ``index``."""

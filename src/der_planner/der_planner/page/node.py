@@ -29,6 +29,7 @@ from apriltag_tracker.camera.images import ImageError, to_grey
 from apriltag_tracker.detection import Tag
 from apriltag_tracker.tag_map import TagMap
 from der_msgs.msg import (
+    LimbContact,
     LimbEstimate,
     LimbState,
     OperatorLease,
@@ -154,6 +155,7 @@ class PageNode(Node):
         subscribe(CameraInfo, topics.CAMERA_INFO, self._on_camera, qos.LATCHED)
         subscribe(CameraInfo, topics.CAMERA_INFO, self._on_camera, qos.IMAGES)
         subscribe(LimbEstimate, topics.ESTIMATE, self._on_estimate, qos.STATES)
+        subscribe(LimbContact, topics.CONTACT, situation.put_contact, qos.STATES)
         subscribe(Log, ROSOUT, situation.put_log, qos.STATES)
         subscribe(DiagnosticArray, topics.DIAGNOSTICS, self._on_diagnostics, qos.STATES)
 

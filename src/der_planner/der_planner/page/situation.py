@@ -16,7 +16,7 @@ import psutil
 from diagnostic_msgs.msg import DiagnosticStatus
 from rcl_interfaces.msg import Log
 
-from der_msgs.msg import LimbEstimate, LimbState, PressurePlan, PressureState
+from der_msgs.msg import LimbContact, LimbEstimate, LimbState, PressurePlan, PressureState
 from der_planner.limb import mounting_of
 from der_planner.page.alarm import NODES, alarms, describe_limb, missing, worst_first
 from limb_interfaces.diagnostics import ENDED_IN_ORDER
@@ -26,7 +26,7 @@ PASCAL_PER_KILOPASCAL = 1000.0
 CENTIMETRES = 100.0
 GRAMS = 1000.0
 PERCENT = 100.0
-FRESH = {"driver": 0.5, "tracker": 0.5, "camera": 0.7, "estimate": 0.5}
+FRESH = {"driver": 0.5, "tracker": 0.5, "camera": 0.7, "estimate": 0.5, "contact": 0.5}
 """The newest message of a source may be this old [s] before the page greys it."""
 LATE = 1.6
 """A node counts as late after this time [s] without diagnostics, which it sends once a second."""
@@ -130,6 +130,10 @@ class Situation:
             "reason": message.reason,
         }
         self.hear("estimate", values)
+
+    def put_contact(self, message: LimbContact) -> None:
+        """Take what touches the limb."""
+        self.hear("contact", {"touched": message.touched, "said": message.said})
 
     def put_plan(self, message: PressurePlan) -> None:
         """Take the newest plan; it is shown as a line for people."""
@@ -251,6 +255,7 @@ class Situation:
             "limb": limb and {**limb, "error_cm": self._tip_error()},
             "plan": self._plan,
             "estimate": values.get("estimate"),
+            "contact": values.get("contact"),
             "nodes": worst_first(nodes),
             "missing": missing(nodes),
             "limb_is": describe_limb(values.get("driver")),

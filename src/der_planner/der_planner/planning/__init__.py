@@ -7,6 +7,7 @@ from der_planner.model import CONTROL_PERIOD
 from der_planner.planning.configuration import METHODS
 from der_planner.planning.loads import BucklingError, OverloadError, PlanningError
 from der_planner.planning.motions import NAMES, Motion, Reference
+from der_planner.planning.obstacles import ObstacleError, Obstacles
 from der_planner.planning.plan_file import Plan
 from der_planner.planning.planner import choose_method, plan
 from der_planner.planning.timing import PathLimits, Start
@@ -18,6 +19,8 @@ __all__ = [
     "NAMES",
     "BucklingError",
     "Motion",
+    "ObstacleError",
+    "Obstacles",
     "OverloadError",
     "PathLimits",
     "Plan",

@@ -16,6 +16,7 @@ from der_planner.model.commands import commands as commands_for
 from der_planner.planning.configuration import METHODS, Configuration, configure
 from der_planner.planning.loads import PlanningError, nearly_buckling
 from der_planner.planning.motions import Motion, Reference
+from der_planner.planning.obstacles import Obstacles
 from der_planner.planning.optimal import Optimiser, Optimum
 from der_planner.planning.plan_file import Plan
 from der_planner.planning.timing import Start
@@ -44,6 +45,7 @@ def plan(
     nodes: int = NODES,
     start: Start | None = None,
     progress: Callable[[float], None] | None = None,
+    obstacles: Obstacles | None = None,
 ) -> Plan:
     """Plan the chamber pressures for a motion.
 
@@ -55,6 +57,7 @@ def plan(
         nodes: of the rod.
         start: where another motion is left; None: where the vented limb rests.
         progress: called with the share that is done, 0 … 1.
+        obstacles: in the way of the limb; None: nothing.
 
     The plan's `warnings` say where limits cut the wanted pressures, and where the limb's numbers
     are those of another mounting.
@@ -63,6 +66,7 @@ def plan(
         PlanningError: unknown model or method.
         UnreachableError: a point is out of reach or needs more pressure than allowed.
         OverloadError: holding the limb under its loads takes more pressure than allowed.
+        ObstacleError: the limb would run into an obstacle.
         BucklingError: the limb does not stay where it rests, or on the way.
     """
     begin = clock.perf_counter()
@@ -74,6 +78,10 @@ def plan(
         body = rod if model == "der" else Model.of(limb, model)
         reference = motion.reference(Workspace(rod), start)
         configuration = configure(body, reference)
+        bend = configuration.bend_at(reference.time)
+        if obstacles is not None:
+            curves = configuration.curves(reference.time)
+            obstacles.check(rod, reference.time, curves, bend)
         report(0.3)
         try:
             # The optimum begins from the projected balance.
@@ -85,7 +93,7 @@ def plan(
                 f"the rod cannot be rolled forward along this motion ({error}): take a longer "
                 "period, a smaller amplitude, or check the limb file's stiffness and mass"
             ) from error
-    bend, seen = configuration.bend_at(reference.time), body.limb
+    seen = body.limb
     said = [
         str(reference.deviation or ""),
         seen.other_mounting,

@@ -204,6 +204,7 @@ def _pressure_errors(run: RunSeries, first: float, last: float) -> tuple[float, 
 
 def _problems(run: RunSeries, valid: float, longest: float) -> tuple[str, ...]:
     found = [f"the driver reported a fault: {text}" for text in run.faults]
+    found += [f"something touched the limb {text}" for text in run.touches]
     if not run.finished:
         found.append("the motion was not played or not recorded to its end")
     if valid < LEAST_VALID:

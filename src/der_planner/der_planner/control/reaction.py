@@ -1,0 +1,102 @@
+"""What is done about a touch: warn, hold, yield or vent.
+
+A touch is worth an effective pressure ℓ per segment (`Touch.pressure`): bending further against it
+raises the force. A change δu of the pressures in the chambers does so as far as −ℓ·δu > 0. While
+something is touched, `yield` gives no command u with −ℓ·u above the least that the plan has asked
+for and the chambers have held since: what the plan and its corrections want is moved to the nearest
+command on that side. What corrections pressed before the touch was noticed is taken back, the limb
+retreats as the plan does, does not follow when the plan presses again, and is free once the touch
+has ended. With a limit in N the bound is where the force would reach it: against something
+that does not move, pressures raise the force at a place with compliance C_p by
+−f̂ᵀ (∂p/∂u) δu / (f̂ᵀ C_p f̂).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Literal, get_args
+
+import numpy as np
+
+from der_planner.arrays import Array
+from der_planner.control.touch import Touch
+from der_planner.model import RodModel
+from der_planner.model.compliance import compliance
+
+Kind = Literal["warn", "hold", "yield", "vent"]
+KINDS: tuple[Kind, ...] = get_args(Kind)
+_SMALLEST = 1e-9
+"""A pressure below this gives no direction [Pa]."""
+
+
+class Reaction:
+    """Keeps commands from raising the force of a touch; see the module.
+
+    Args:
+        model: rod of the limb.
+        kind: one of `KINDS`. `vent` holds, and says with `vents` that the limb is to be vented.
+        limit: force that is allowed [N]; None: none more than there is.
+
+    Raises:
+        ValueError: another kind, or a limit that is no force.
+    """
+
+    def __init__(self, model: RodModel, kind: Kind = "yield", limit: float | None = None) -> None:
+        if kind not in KINDS:
+            raise ValueError(f"a reaction is one of {', '.join(KINDS)}, got {kind!r}")
+        if limit is not None and not (math.isfinite(limit) and limit >= 0.0):
+            raise ValueError(f"a limit of the force must be 0 N or more, got {limit}")
+        self.kind, self.limit = kind, limit
+        self._model = model
+        self._held: Array | None = None
+        self._bound = np.zeros(0), 0.0
+
+    @property
+    def acts(self) -> bool:
+        """Whether it may change commands."""
+        return self.kind != "warn"
+
+    @property
+    def vents(self) -> bool:
+        """Whether the limb is to be vented."""
+        return self.kind == "vent" and self._held is not None
+
+    def follow(self, planned: Array, touch: Touch, chambers: Array) -> None:
+        """Look at a touch, or that there is none, before a command is asked for.
+
+        Args:
+            planned: (M,) the plan's own command [Pa].
+            touch: as it is known now.
+            chambers: (M,) differential pressures in them now [Pa].
+        """
+        if not (touch.touched and self.acts):
+            self._held = None
+            return
+        if self._held is None:
+            self._held = chambers
+        if self.kind != "yield":
+            return
+        harder = -touch.pressure / max(float(np.linalg.norm(touch.pressure)), _SMALLEST)
+        self._held = min(self._held, chambers, planned, key=lambda each: float(harder @ each))
+        self._bound = harder, float(harder @ self._held)
+        if self.limit is not None and np.isfinite([touch.place, *touch.force]).all():
+            self._bound = self._limited(touch, chambers, self.limit)
+
+    def allowed(self, wanted: Array) -> Array:
+        """Return the command (M,) [Pa] in place of a wanted one."""
+        if self._held is None:
+            return wanted
+        if self.kind != "yield":
+            return self._held
+        harder, bound = self._bound
+        square = max(float(harder @ harder), _SMALLEST**2)
+        return wanted - harder * (max(0.0, float(harder @ wanted) - bound) / square)
+
+    def _limited(self, touch: Touch, chambers: Array, limit: float) -> tuple[Array, float]:
+        """Return how pressures raise the force (M,) [N/Pa], and how far that may go [N]."""
+        limp = compliance(self._model, touch.bend_angles, [touch.place])
+        size = float(np.linalg.norm(touch.force))
+        along = touch.force / size
+        slack = float(along @ limp.place[0] @ along)
+        harder = -(along @ limp.place_by_pressure[0]) / slack
+        return harder, float(harder @ chambers) + limit - size

@@ -1,0 +1,336 @@
+"""Touch: what pressures, loads and friction do not explain of the shape is a force.
+
+The estimator (`der_planner.control.estimation`) says per segment the pressure d + g w that the
+model lacks, and a displacement b of the tip that the bend angles do not explain. A force f at a
+place s makes both, by the compliance of the rod (`der_planner.model.compliance`): with C_θ and C_r
+of bend and tip by the force, C_w of the bend by pressure, and J = ∂tip/∂θ of evenly bent segments,
+
+    lacking pressure = C_w⁻¹ C_θ(s) f        b = (C_r(s) − J C_θ(s)) f
+
+These are M + 2 numbers for the three unknowns of a force in the plane. What a force along the limb
+does to it is hardly seen, and what touches the limb from its side pushes across it, with some
+friction: the part along the limb is expected to be a share of that across. For every place the
+force of the largest likelihood is then linear; the likelihood of the places, each with its force,
+gives place and force with what is in doubt of them.
+
+Without contact the same numbers are not zero either: gains, friction and the camera are a little
+wrong. A segment then lacks c + γ w and some noise, and more where friction turns round; the tip is
+off by a constant and some noise. These are learned while nothing is touched: they are the free
+level. A distance from it that noise would pass once in an hour is a touch.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import gammainccinv
+
+from der_planner.arrays import Array
+from der_planner.control.knowledge import Knowledge
+from der_planner.model import RodModel
+from der_planner.model.compliance import compliance
+
+_HOUR = 3600.0
+_CORRELATED = 0.3
+"""Time after which what the model lacks says something new [s]."""
+_RELEASED = 0.5
+"""Share of the threshold below which a touch ends."""
+_FREE_PRESSURE = 250.0
+"""Standard deviation of c and of the noise, of a limb that nothing is known of yet [Pa]."""
+_FREE_GAIN = 0.15
+"""The same of γ."""
+_FREE_TIP = 5e-4
+"""The same of the tip's displacement and of its noise [m]."""
+_FIRST_WORTH = 10.0
+"""Time of watching that the guess of the noise is worth [s]."""
+_WATCHED = 600.0
+"""Time in which noise that was watched is forgotten [s]."""
+_SAYS_NEW = 0.5
+"""Time after which noise says something new of c, γ and the tip's displacement [s]."""
+_LEARNED_AFTER = 1.0
+"""What no touch follows for so long is learned: contact that begins slowly is not [s]."""
+_FRICTION_WRONG = 0.5
+"""Standard deviation of friction from its model where it turns round, over its largest."""
+_FRICTION_SLIDING = 0.1
+"""Variance elsewhere, over that."""
+_LARGEST_FORCE = 2.0
+"""Standard deviation of the forces across the limb that are expected [N]."""
+_RUBS = 0.3
+"""Standard deviation of a force along the limb, over the force across it at the same place."""
+_LEAST_ALONG = 0.01
+"""Force along the limb that is expected anyway, a standard deviation [N]."""
+_PLACES = 60
+"""Places along the limb that are tried."""
+_PLACE_TOLD = 0.1
+"""Standard deviation of the place, over the limb's length, up to which it is told."""
+_UNLIKELY = 1e-3
+"""Probability of what is left of the data below which it is not one force."""
+
+
+@dataclass(frozen=True)
+class Lacking:
+    """What the model lacks of the limb at an instant.
+
+    Attributes:
+        time: [s].
+        bend_angles: (M,) [rad].
+        effective: (M,) pressure w of the model [Pa].
+        value: (M + 2,) pressure that the model lacks [Pa], and the tip's displacement that the
+            bend angles do not explain [m].
+        covariance: of value, with what friction may differ from its model.
+    """
+
+    time: float
+    bend_angles: Array
+    effective: Array
+    value: Array
+    covariance: Array
+
+    @staticmethod
+    def of(time: float, bend_angles: Array, known: Knowledge, friction: Array) -> Lacking:
+        """Return what the estimator says that the model lacks.
+
+        Args:
+            time: [s].
+            bend_angles: (M,) [rad].
+            known: the filter's state then.
+            friction: (M,) the largest that the model knows [Pa].
+        """
+        inputs = len(bend_angles)
+        rows = np.zeros((inputs + 2, len(known.mean)))
+        rows[:inputs, 2 * inputs : 3 * inputs] = np.eye(inputs)
+        rows[:inputs, 3 * inputs : 4 * inputs] = np.diag(known.effective)
+        rows[inputs:, 4 * inputs :] = np.eye(2)
+        spread = rows @ known.covariance @ rows.T
+        turning = np.minimum(1.0, _FRICTION_SLIDING + 1.0 - known.memory.friction**2)
+        spread[:inputs, :inputs] += np.diag((_FRICTION_WRONG * friction) ** 2 * turning)
+        return Lacking(time, bend_angles, known.effective, rows @ known.mean, spread)
+
+
+@dataclass(frozen=True)
+class Touch:
+    """What is known of a touch at an instant.
+
+    Attributes:
+        time: [s].
+        bend_angles: (M,) of the limb then [rad].
+        touched: whether something touches the limb.
+        since: when it began [s]; NaN: nothing touches.
+        pressure: (M,) effective pressure that bends the limb as the touch does [Pa]; NaN: nothing
+            touches.
+        distance: squared distance from the free level over that of one false alarm in an hour.
+        place: along the limb from its clamp [m]; NaN: it cannot be told.
+        place_deviation: its standard deviation, told or not [m].
+        force: (2,) on the limb [N]; NaN: it cannot be told.
+        force_covariance: (2, 2), told or not [N²].
+        said: a sentence on what is told; empty while nothing touches.
+    """
+
+    time: float
+    bend_angles: Array
+    touched: bool
+    since: float
+    pressure: Array
+    distance: float
+    place: float
+    place_deviation: float
+    force: Array
+    force_covariance: Array
+    said: str
+
+
+def untouched(time: float, bend_angles: Array, distance: float = 0.0) -> Touch:
+    """Return that nothing touches a limb of bend angles (M,) [rad] at an instant [s]."""
+    nothing = np.full(2, np.nan)
+    unknown = np.full((2, 2), np.nan)
+    pressure, never = np.full(len(bend_angles), np.nan), np.nan
+    about = pressure, distance, np.nan, np.nan, nothing, unknown, ""
+    return Touch(time, bend_angles, False, never, *about)
+
+
+class FreeLevel:
+    """What the model lacks of a limb that nothing touches: c + γ w, the tip's displacement, noise.
+
+    Args:
+        inputs: M segments.
+    """
+
+    def __init__(self, inputs: int) -> None:
+        first = np.repeat([_FREE_PRESSURE, _FREE_TIP], [inputs, 2])
+        self._mean = np.zeros((inputs + 2, 2))
+        slope = np.repeat([_FREE_GAIN, 0.0], [inputs, 2])
+        self._covariance = np.square([first, slope]).T[:, None] * np.eye(2)
+        self.noise = first**2
+        self._worth = _FIRST_WORTH
+
+    def expected(self, effective: Array) -> tuple[Array, Array]:
+        """Return mean and variance (M + 2,) under an effective pressure (M,) [Pa]; noise counts."""
+        by = self._by(effective)
+        unknown = np.einsum("ia,iab,ib->i", by, self._covariance, by)
+        return (by * self._mean).sum(axis=1), unknown + self.noise
+
+    def learn(self, lacking: Lacking, duration: float) -> None:
+        """Take in what held for a time [s] without contact."""
+        by, other = self._by(lacking.effective), np.diag(lacking.covariance)
+        mean, variance = self.expected(lacking.effective)
+        away = lacking.value - mean
+        seen = np.einsum("iab,ib->ia", self._covariance, by)
+        old = _SAYS_NEW / duration * (self.noise + other)
+        gain = seen / (variance - self.noise + old)[:, None]
+        self._mean = self._mean + gain * away[:, None]
+        self._covariance = self._covariance - gain[:, :, None] * seen[:, None, :]
+        # How much of what is away is noise, by what is expected of each.
+        part = self.noise / (variance + other)
+        found = (part * away) ** 2 + self.noise * (1.0 - part)
+        self.noise = self.noise + duration / (self._worth + duration) * (found - self.noise)
+        self._worth = min(self._worth + duration, _WATCHED)
+
+    def _by(self, effective: Array) -> Array:
+        """Return what c and γ are multiplied by (M + 2, 2)."""
+        return np.column_stack([np.ones(len(self.noise)), np.append(effective, np.zeros(2))])
+
+
+class TouchSense:
+    """Watches what the model lacks of a limb; see the module.
+
+    Args:
+        model: rod of the limb.
+        free: what is known of the limb without contact.
+    """
+
+    def __init__(self, model: RodModel, free: FreeLevel | None = None) -> None:
+        self._model = model
+        self.free = free or FreeLevel(model.inputs)
+        limb = model.limb
+        self._places = np.linspace(limb.base_length, limb.length, _PLACES + 1)[1:]
+        self.threshold = _chance(_CORRELATED / _HOUR, model.inputs + 2)
+        self.newest = untouched(-np.inf, np.zeros(model.inputs))
+        self._recent: deque[tuple[Lacking, float]] = deque()
+
+    def feel(self, time: float, bend_angles: Array, known: Knowledge) -> Touch:
+        """Return what a newer state of the estimator says of a touch.
+
+        Args:
+            time: [s].
+            bend_angles: (M,) [rad].
+            known: the filter's state then.
+        """
+        segments = self._model.limb.segments
+        friction = np.array([s.friction_moment / s.moment_gain for s in segments])
+        return self.look(Lacking.of(time, bend_angles, known, friction))
+
+    def look(self, lacking: Lacking) -> Touch:
+        """Return what a newer instant says of a touch."""
+        before = self.newest
+        mean, variance = self.free.expected(lacking.effective)
+        value, noise = lacking.value - mean, lacking.covariance + np.diag(variance)
+        distance = float(value @ np.linalg.solve(noise, value)) / self.threshold
+        touched = distance > (_RELEASED if before.touched else 1.0)
+        if touched:
+            since = before.since if before.touched else lacking.time
+            found = locate(self._model, replace(lacking, value=value), noise, self._places)
+            self.newest = replace(found, since=since, distance=distance)
+            self._recent.clear()
+            return self.newest
+        self.newest = untouched(lacking.time, lacking.bend_angles, distance)
+        if distance < _RELEASED and 0.0 < lacking.time - before.time < _LEARNED_AFTER:
+            self._recent.append((lacking, lacking.time - before.time))
+        while self._recent and self._recent[0][0].time < lacking.time - _LEARNED_AFTER:
+            self.free.learn(*self._recent.popleft())
+        return self.newest
+
+
+def locate(model: RodModel, lacking: Lacking, noise: Array, places: Array) -> Touch:
+    """Return the force that explains what the model lacks, and where it acts.
+
+    Args:
+        model: rod of the limb.
+        lacking: of the model, less the free level.
+        noise: covariance of it (M + 2, M + 2).
+        places: (P,) evenly spaced, where the force may act [m].
+    """
+    axes = _axes(model, lacking.bend_angles, places)
+    effect = effects(model, lacking.bend_angles, places) @ axes
+    weight = np.linalg.inv(noise)
+    seen = np.swapaxes(effect, 1, 2) @ weight
+    square, pull = seen @ effect, seen @ lacking.value
+    across = pull[:, 1] / (square[:, 1, 1] + 1.0 / _LARGEST_FORCE**2)
+    expected = np.full_like(pull, _LARGEST_FORCE)
+    expected[:, 0] = _LEAST_ALONG + _RUBS * np.abs(across)
+    told = square + (expected**-2.0)[:, :, None] * np.eye(2)
+    forces = np.linalg.solve(told, pull[..., None])[..., 0]
+    left = lacking.value @ weight @ lacking.value - (pull * forces).sum(axis=1)
+    likely = -0.5 * (left + np.linalg.slogdet(told)[1]) - np.log(expected[:, 0])
+    share = np.exp(likely - likely.max())
+    share /= share.sum()
+    place = float(share @ places)
+    deviation = float(np.sqrt(share @ (places - place) ** 2 + (places[1] - places[0]) ** 2 / 12))
+    turned = np.einsum("pab,pb->pa", axes, forces)
+    force = share @ turned
+    apart = turned - force
+    spread = axes @ np.linalg.inv(told) @ np.swapaxes(axes, 1, 2)
+    spread = spread + apart[:, :, None] * apart[:, None, :]
+    covariance = np.einsum("p,pab->ab", share, spread)
+    known = replace(
+        untouched(lacking.time, lacking.bend_angles),
+        touched=True,
+        since=lacking.time,
+        pressure=lacking.value[:-2],
+        place=place,
+        place_deviation=deviation,
+        force=force,
+        force_covariance=covariance,
+    )
+    return _told(known, float(left.min()), model)
+
+
+def effects(model: RodModel, bend_angles: Array, places: Array) -> Array:
+    """Return what a unit force makes the model lack (P, M + 2, 2) [Pa/N], [m/N], see the module."""
+    limp = compliance(model, bend_angles, places)
+    jacobian = model.kinematics.tip_jacobians(bend_angles)
+    lacking = np.linalg.solve(limp.bend_by_pressure, limp.bend)
+    return np.concatenate([lacking, limp.tip - jacobian @ limp.bend], axis=1)
+
+
+def _axes(model: RodModel, bend_angles: Array, places: Array) -> Array:
+    """Return the directions along and across the limb at places, as columns (P, 2, 2)."""
+    even = model.kinematics
+    edges = np.searchsorted(np.cumsum(even.rest_lengths[:-1]) + even.base, places)
+    heading = even.turning[edges] @ bend_angles
+    cosine, sine = np.cos(heading), np.sin(heading)
+    return np.moveaxis(np.array([[cosine, -sine], [sine, cosine]]), 2, 0)
+
+
+def _told(found: Touch, left: float, model: RodModel) -> Touch:
+    """Say what can be told of a force, and leave out what cannot.
+
+    Args:
+        found: place and force of the largest likelihood.
+        left: squared distance of the data from the best force.
+        model: of the limb.
+    """
+    nothing = np.full(2, np.nan)
+    spare = max(1, model.inputs - 1)
+    if left > _chance(_UNLIKELY, spare):
+        return replace(
+            found, place=np.nan, force=nothing, said="at more than one point, or not by a force"
+        )
+    deviations, directions = np.linalg.eigh(found.force_covariance)
+    size = float(np.linalg.norm(found.force))
+    said = f"{size:.2f} N"
+    where = f"at {found.place * 100:.1f} cm (± {found.place_deviation * 100:.1f})"
+    if found.place_deviation > _PLACE_TOLD * model.limb.length:
+        found, where = replace(found, place=np.nan), "where cannot be told"
+    widest = float(np.sqrt(deviations[-1]))
+    if widest > size:
+        x, y = directions[:, -1]
+        said = f"how strong along ({x:.2f}, {y:.2f}) cannot be told (± {widest:.2f} N)"
+        found = replace(found, force=nothing)
+    return replace(found, said=f"{said}, {where}")
+
+
+def _chance(probability: float, count: int) -> float:
+    """Return what the sum of ``count`` squares of normal numbers exceeds with a probability."""
+    return float(2.0 * gammainccinv(count / 2, probability))

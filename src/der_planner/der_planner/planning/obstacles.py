@@ -1,0 +1,224 @@
+"""Things in the way of a limb: how far a motion keeps from them, with what force it touches.
+
+A file names circles and half-planes in `limb_base`, in metres and newtons:
+
+    limb_radius_m: 0.015
+    obstacles:
+      - {circle_m: [0.12, 0.10], radius_m: 0.01, allowed_force_n: 0.2}
+      - {half_plane_m: [0.0, -0.08], normal: [0, 1]}       # the limb stays where the normal points
+
+The clearance of a pose is the distance of its centreline from an obstacle less both radii. Where it
+is negative, the limb does not come so far: what does not move pushes it back by that much, with the
+force that the compliance there gives, f = −clearance / (nᵀ C_p n). A motion for which this is more
+than an obstacle allows is refused.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from der_planner.arrays import Array
+from der_planner.model import RodModel
+from der_planner.model.compliance import compliance
+from der_planner.planning.loads import PlanningError
+
+_CIRCLE = {"circle_m", "radius_m", "allowed_force_n"}
+_HALF_PLANE = {"half_plane_m", "normal", "allowed_force_n"}
+_FINE = 4
+"""Points a piece of the centreline between two nodes."""
+
+
+@dataclass(frozen=True)
+class Obstacle:
+    """A circle, or a half-plane if it has no radius.
+
+    Attributes:
+        point: (2,) the circle's centre, or a point of the half-plane's edge [m].
+        radius: of the circle [m]; None: a half-plane.
+        normal: (2,) unit vector out of the half-plane; zeros of a circle.
+        allowed_force: with which the limb may touch it [N].
+    """
+
+    point: Array
+    radius: float | None
+    normal: Array
+    allowed_force: float
+
+    def away(self, points: Array) -> tuple[Array, Array]:
+        """Return the distances (…,) of points (…, 2) [m] and the directions (…, 2) out of it."""
+        between = points - self.point
+        if self.radius is None:
+            return between @ self.normal, np.broadcast_to(self.normal, points.shape)
+        distance = np.linalg.norm(between, axis=-1)
+        out = between / np.maximum(distance, 1e-12)[..., None]
+        return distance - self.radius, out
+
+    def __str__(self) -> str:
+        """Return its name for people."""
+        place = f"({self.point[0]:.4f}, {self.point[1]:.4f}) m"
+        return f"the edge at {place}" if self.radius is None else f"the circle at {place}"
+
+
+@dataclass(eq=False)
+class ObstacleError(PlanningError):
+    """A motion would touch an obstacle with more force than that allows.
+
+    Attributes:
+        time: when it would be worst [s].
+        place: along the limb from its clamp [m].
+        clearance: there, negative [m].
+        force: that it would take [N].
+        obstacle: which one.
+    """
+
+    time: float
+    place: float
+    clearance: float
+    force: float
+    obstacle: Obstacle
+
+    def __str__(self) -> str:
+        """Return a sentence for people."""
+        return (
+            f"at t = {self.time:.2f} s the limb would run {-self.clearance * 1000:.1f} mm into "
+            f"{self.obstacle}, {self.place * 100:.1f} cm from its clamp, with {self.force:.2f} N "
+            f"({self.obstacle.allowed_force:.2f} N are allowed): shrink or move the motion"
+        )
+
+
+@dataclass(frozen=True)
+class Nearest:
+    """Where a motion comes nearest to an obstacle.
+
+    Attributes:
+        clearance: [m]; negative: it would run into it.
+        index: of the pose.
+        place: along the limb from its clamp [m].
+        out: (2,) direction out of the obstacle.
+    """
+
+    clearance: float
+    index: int
+    place: float
+    out: Array
+
+
+@dataclass(frozen=True)
+class Obstacles:
+    """All that is in the way of one limb.
+
+    Attributes:
+        limb_radius: of the limb [m].
+        items: the obstacles.
+    """
+
+    limb_radius: float
+    items: tuple[Obstacle, ...]
+
+    @staticmethod
+    def from_yaml(path: str | Path) -> Obstacles:
+        """Read a file, see the module.
+
+        Raises:
+            PlanningError: the file cannot be read or says something else; names it.
+        """
+        try:
+            content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+            return Obstacles.from_mapping(content)
+        except (OSError, yaml.YAMLError, ValueError, TypeError, KeyError) as error:
+            raise PlanningError(f"{path} cannot be used as a file of obstacles: {error}") from error
+
+    @staticmethod
+    def from_mapping(content: Any) -> Obstacles:
+        """Return what a file's content says.
+
+        Raises:
+            ValueError: a key is unknown or missing, or a number is not one that can be.
+        """
+        if not isinstance(content, Mapping) or set(content) != {"limb_radius_m", "obstacles"}:
+            raise ValueError("expected limb_radius_m and obstacles, and nothing else")
+        items = tuple(_obstacle(item) for item in content["obstacles"])
+        return Obstacles(_number(content["limb_radius_m"], "limb_radius_m"), items)
+
+    def nearest(self, obstacle: Obstacle, curves: Array) -> Nearest:
+        """Return where poses come nearest to an obstacle.
+
+        Args:
+            obstacle: of these.
+            curves: (K, P, 2) centrelines from the clamp on [m].
+        """
+        share = np.arange(_FINE) / _FINE
+        pieces = curves[:, :-1, None] + share[:, None] * np.diff(curves, axis=1)[:, :, None]
+        points = np.concatenate([pieces.reshape(len(curves), -1, 2), curves[:, -1:]], axis=1)
+        distance, out = obstacle.away(points)
+        k, p = np.unravel_index(int(np.argmin(distance)), distance.shape)
+        along = np.linalg.norm(np.diff(points[k], axis=0), axis=1)[:p].sum()
+        clearance = float(distance[k, p]) - self.limb_radius
+        return Nearest(clearance, int(k), float(along + points[k, 0, 0]), out[k, p])
+
+    def check(self, model: RodModel, time: Array, curves: Array, bend_angles: Array) -> None:
+        """Refuse a motion that would touch an obstacle with more force than that allows.
+
+        Args:
+            model: rod of the limb.
+            time: (K,) of the poses [s].
+            curves: (K, P, 2) their centrelines [m].
+            bend_angles: (K, M) of them [rad].
+
+        Raises:
+            ObstacleError: names instant, place, clearance and force.
+        """
+        for obstacle in self.items:
+            found = self.nearest(obstacle, curves)
+            if found.clearance >= 0.0:
+                continue
+            limp = compliance(model, bend_angles[found.index], [found.place])
+            slack = float(found.out @ limp.place[0] @ found.out)
+            force = -found.clearance / slack if slack > 0.0 else math.inf
+            if force > obstacle.allowed_force:
+                instant = float(time[found.index])
+                raise ObstacleError(instant, found.place, found.clearance, force, obstacle)
+
+
+def _obstacle(item: Any) -> Obstacle:
+    """Return one obstacle of a file.
+
+    Raises:
+        ValueError: it is neither a circle nor a half-plane.
+    """
+    keys = set(item) if isinstance(item, Mapping) else set()
+    allowed = _number(item.get("allowed_force_n", 0.0), "allowed_force_n") if keys else 0.0
+    if "circle_m" in keys and keys <= _CIRCLE:
+        radius = _number(item["radius_m"], "radius_m")
+        return Obstacle(_pair(item["circle_m"], "circle_m"), radius, np.zeros(2), allowed)
+    if "half_plane_m" in keys and keys <= _HALF_PLANE:
+        normal = _pair(item["normal"], "normal")
+        size = float(np.linalg.norm(normal))
+        if size == 0.0:
+            raise ValueError("the normal of a half-plane has a direction")
+        return Obstacle(_pair(item["half_plane_m"], "half_plane_m"), None, normal / size, allowed)
+    raise ValueError(
+        f"an obstacle has {', '.join(sorted(_CIRCLE))}, or {', '.join(sorted(_HALF_PLANE))}; got "
+        f"{item}"
+    )
+
+
+def _number(value: Any, name: str) -> float:
+    number = float(value)
+    if not (math.isfinite(number) and number >= 0.0):
+        raise ValueError(f"{name} must be 0 or more, got {value}")
+    return number
+
+
+def _pair(value: Sequence[float], name: str) -> Array:
+    pair = np.array(value, dtype=float)
+    if pair.shape != (2,) or not np.isfinite(pair).all():
+        raise ValueError(f"{name} must be two numbers x, y, got {value}")
+    return pair

@@ -1,0 +1,179 @@
+"""Forces on the rod are found from what its bend and tip lack, and commands do not raise them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from der_planner.control.reaction import Reaction
+from der_planner.control.touch import FreeLevel, Lacking, TouchSense, untouched
+from der_planner.limb import Limb
+from der_planner.model import RodModel
+from der_planner.model.compliance import compliance
+
+LIMB = replace(Limb.default(), connector_length=0.0, base_length=0.0)
+DEVIATION = np.array([40.0, 40.0, 2e-4, 2e-4])
+
+
+@pytest.fixture(scope="module")
+def model():
+    return RodModel(LIMB)
+
+
+def calibrated() -> FreeLevel:
+    """Return the free level of a limb that is well known."""
+    free = FreeLevel(2)
+    still = Lacking(0.0, np.zeros(2), np.zeros(2), np.zeros(4), 1e-12 * np.eye(4))
+    for k in range(4000):
+        away = DEVIATION * (-1) ** k
+        free.learn(replace(still, effective=np.array([k % 7, k % 5]) * 1e3, value=away), 0.5)
+    return free
+
+
+def lacking(model, forces, pressure=(6000.0, 3000.0)) -> Lacking:
+    """Return what a model lacks that knows nothing of forces [N] at nodes of its rod."""
+    pressures, applied = np.array(pressure), np.zeros((model.nodes, 3))
+    for node, force in forces.items():
+        applied[node, :2] = force
+    free = model.resting(pressures)
+    pushed = model.rod.equilibrium(pressures, start=free, forces=applied)
+    bend, before = model.bend_of(pushed), model.bend_of(free)
+    missing = np.linalg.solve(compliance(model, bend, [0.1]).bend_by_pressure, bend - before)
+    even = model.kinematics
+    offset = (pushed.q - free.q)[-3:-1] - (even.tip(bend) - even.tip(before))
+    return Lacking(
+        1.0, bend, pressures, np.concatenate([missing, offset]), np.diag((DEVIATION / 4) ** 2)
+    )
+
+
+def frame(model, node, bend) -> np.ndarray:
+    """Return the directions along and across the limb at a node, as columns."""
+    heading = model.kinematics.turning[node - 1] @ bend
+    return np.array([[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]])
+
+
+@pytest.mark.parametrize("node", [10, 15, 20])
+@pytest.mark.parametrize("pushed", [(0.0, 0.1), (0.05, -0.2)])
+def test_a_force_is_found_with_its_place(model, node, pushed):
+    """A force along and across the limb [N]: that of something that touches it from its side."""
+    force = frame(model, node, lacking(model, {}).bend_angles) @ pushed
+    felt = lacking(model, {node: force})
+    touch = TouchSense(model, calibrated()).look(felt)
+    assert touch.touched
+    assert touch.since == 1.0
+    place = node / 20 * LIMB.length
+    assert abs(touch.place - place) < max(0.05 * LIMB.length, 2 * touch.place_deviation)
+    apart = touch.force - force
+    assert apart @ np.linalg.solve(touch.force_covariance, apart) < 9.0
+    # How strong it is along the limb is hardly told.
+    axes = frame(model, node, felt.bend_angles)
+    assert (touch.force @ axes)[1] == pytest.approx((force @ axes)[1], rel=0.15)
+
+
+def test_what_cannot_be_told_is_not_told(model):
+    # Along a straight limb.
+    pulled = TouchSense(model, calibrated()).look(lacking(model, {20: (0.5, 0.0)}, (0.0, 0.0)))
+    assert not pulled.touched
+    # Near the clamp a force moves next to nothing.
+    near = TouchSense(model, calibrated()).look(lacking(model, {3: (0.0, 0.8)}))
+    assert not near.touched or np.isnan(near.place) or near.place < 0.3 * LIMB.length
+    # A pair of forces in mid-limb and at the tip.
+    two = TouchSense(model, calibrated()).look(
+        lacking(model, {7: (0.0, -1.5), 20: (0.0, 0.3)}, (0.0, 0.0))
+    )
+    assert two.touched
+    assert np.isnan(two.place)
+
+
+def test_a_touch_ends_and_the_next_one_has_a_time_of_its_own(model):
+    sense, hit = TouchSense(model, calibrated()), lacking(model, {20: (0.0, 0.2)})
+    nothing = replace(hit, value=np.zeros(4))
+    said = [
+        sense.look(replace(each, time=float(time)))
+        for time, each in enumerate([nothing, hit, hit, nothing, hit])
+    ]
+    assert [touch.touched for touch in said] == [False, True, True, False, True]
+    assert [touch.since for touch in said if touch.touched] == [1.0, 1.0, 4.0]
+    assert said[1].said
+    assert not said[3].said
+
+
+@pytest.mark.slow
+def test_noise_is_taken_for_a_touch_about_once_in_an_hour(model):
+    draw = np.random.default_rng(8)
+    sense, spread = TouchSense(model), np.array([700.0, 300.0, 2e-3, 1e-3])
+    still = Lacking(0.0, np.zeros(2), np.zeros(2), np.zeros(4), 1e-6 * np.diag(spread**2))
+    for k in range(400):
+        value = 0.5 * spread * draw.standard_normal(4)
+        sense.look(replace(still, time=0.3 * k, value=value))
+    alarms = 0
+    for k in range(400, 12400):
+        before = sense.newest.touched
+        value = 0.5 * spread * draw.standard_normal(4)
+        alarms += sense.look(replace(still, time=0.3 * k, value=value)).touched and not before
+    assert alarms <= 5
+
+
+# Reactions -----------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def touch(model):
+    """Something in the way of a limb that bends to the left."""
+    return TouchSense(model, calibrated()).look(lacking(model, {15: (0.0, -0.2)}))
+
+
+CHAMBERS = np.array([6000.0, 3000.0])
+
+
+def reacted(reaction, wanted, planned, touch, chambers):
+    """Return the command in place of a wanted one."""
+    reaction.follow(planned, touch, chambers)
+    return reaction.allowed(wanted)
+
+
+def test_yielding_gives_way_and_does_not_press_again(model, touch):
+    reaction, less = Reaction(model, "yield"), CHAMBERS - 2000.0
+    harder = CHAMBERS + 2000.0
+    kept = reacted(reaction, harder, harder, touch, CHAMBERS)
+    assert touch.pressure @ (kept - CHAMBERS) == pytest.approx(0.0, abs=1e-3)
+    np.testing.assert_array_equal(reacted(reaction, less, less, touch, less), less)
+    kept = reacted(reaction, CHAMBERS, CHAMBERS, touch, less)
+    assert touch.pressure @ (kept - less) == pytest.approx(0.0, abs=1e-3)
+    # What corrections pressed before the touch was noticed is taken back.
+    kept = reacted(Reaction(model, "yield"), CHAMBERS, less, touch, CHAMBERS)
+    assert touch.pressure @ (kept - less) == pytest.approx(0.0, abs=1e-3)
+    ended = untouched(2.0, touch.bend_angles)
+    np.testing.assert_array_equal(reacted(reaction, harder, harder, ended, less), harder)
+
+
+def test_a_limit_lets_the_force_come_to_it(model, touch):
+    for limit in (0.1, 0.4):
+        reaction = Reaction(model, "yield", limit)
+        kept = reacted(reaction, CHAMBERS + 9000.0, CHAMBERS, touch, CHAMBERS)
+        # Something that does not move: the force by which the place stays where it is.
+        limp = compliance(model, touch.bend_angles, [touch.place])
+        along = touch.force / np.linalg.norm(touch.force)
+        moved = along @ limp.place_by_pressure[0] @ (kept - CHAMBERS)
+        force = np.linalg.norm(touch.force) - moved / (along @ limp.place[0] @ along)
+        assert force == pytest.approx(limit, abs=1e-6)
+
+
+def test_holding_and_venting_keep_what_the_chambers_had(model, touch):
+    wanted = CHAMBERS + 2000.0
+    for kind in ("hold", "vent"):
+        reaction = Reaction(model, kind)
+        assert not reaction.vents
+        for now in (CHAMBERS, 0.5 * CHAMBERS):
+            kept = reacted(reaction, wanted, CHAMBERS, touch, now)
+            np.testing.assert_array_equal(kept, CHAMBERS)
+        assert reaction.vents == (kind == "vent")
+    unchanged = reacted(Reaction(model, "warn"), wanted, CHAMBERS, touch, CHAMBERS)
+    np.testing.assert_array_equal(unchanged, wanted)
+
+
+def test_what_is_no_reaction_is_refused(model):
+    with pytest.raises(ValueError, match="warn, hold, yield, vent"):
+        Reaction(model, "flee")
+    with pytest.raises(ValueError, match="0 N or more"):
+        Reaction(model, "yield", -1.0)

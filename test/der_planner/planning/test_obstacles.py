@@ -1,0 +1,73 @@
+"""Things in the way: the clearance of a motion, the force of a touch, and what is refused."""
+
+import numpy as np
+import pytest
+
+from der_planner.limb import Limb
+from der_planner.planning import Motion, ObstacleError, Obstacles, PlanningError, plan
+
+LIMB = Limb.default()
+MOTION = Motion.named("same_direction", amplitude=0.4, period=4.0, cycles=1)
+RADIUS = 0.015
+
+
+def circle(point, radius=0.01, allowed=0.0):
+    item = {"circle_m": list(point), "radius_m": radius, "allowed_force_n": allowed}
+    return Obstacles.from_mapping({"limb_radius_m": RADIUS, "obstacles": [item]})
+
+
+@pytest.fixture(scope="module")
+def free():
+    return plan(LIMB, MOTION, method="projected")
+
+
+def beside(free, share, depth):
+    """Return an obstacle that the limb runs into by a depth [m] where it bends most."""
+    k = int(np.argmax(free.bend_angles.sum(axis=1)))
+    curve = free.curve(k)
+    node = round(share * (len(curve) - 1))
+    along = curve[node + 1] - curve[node - 1]
+    left = np.array([-along[1], along[0]]) / np.linalg.norm(along)
+    return curve[node] + left * (RADIUS + 0.01 - depth), free.time[k]
+
+
+@pytest.mark.parametrize("share", [0.5, 0.8])
+def test_a_motion_into_a_peg_is_refused_with_instant_place_and_clearance(free, share):
+    point, when = beside(free, share, 0.006)
+    with pytest.raises(ObstacleError, match="mm into the circle") as refused:
+        plan(LIMB, MOTION, method="projected", obstacles=circle(point))
+    error = refused.value
+    assert error.time == pytest.approx(when, abs=0.3)
+    assert error.place == pytest.approx(share * LIMB.length, abs=0.05 * LIMB.length)
+    assert error.clearance == pytest.approx(-0.006, abs=1e-3)
+    # So it is with a force that is a little too small, and not with one that is enough.
+    with pytest.raises(ObstacleError):
+        plan(LIMB, MOTION, method="projected", obstacles=circle(point, allowed=0.9 * error.force))
+    plan(LIMB, MOTION, method="projected", obstacles=circle(point, allowed=1.1 * error.force))
+
+
+def edge(y, normal):
+    item = {"half_plane_m": [0.0, y], "normal": [0.0, normal]}
+    return Obstacles.from_mapping({"limb_radius_m": RADIUS, "obstacles": [item]})
+
+
+def test_what_is_beside_the_motion_changes_nothing(free):
+    point, _ = beside(free, 0.8, -0.002)
+    for way in (circle(point), edge(-RADIUS - 0.001, 2.0)):
+        kept = plan(LIMB, MOTION, method="projected", obstacles=way)
+        np.testing.assert_array_equal(kept.differential_pressure, free.differential_pressure)
+    with pytest.raises(ObstacleError, match="the edge at"):
+        plan(LIMB, MOTION, method="projected", obstacles=edge(0.05, -1.0))
+
+
+def test_a_file_says_what_is_wrong_with_it(tmp_path):
+    file = tmp_path / "obstacles.yaml"
+    for text, said in (
+        ("limb_radius_m: 0.01\nobstacles: [{radius_m: 0.01}]\n", "an obstacle has"),
+        ("limb_radius_m: -1\nobstacles: []\n", "0 or more"),
+        ("obstacles: []\n", "limb_radius_m"),
+        ("limb_radius_m: 0.01\nobstacles: [{half_plane_m: [0, 0], normal: [0, 0]}]", "direction"),
+    ):
+        file.write_text(text)
+        with pytest.raises(PlanningError, match=said):
+            Obstacles.from_yaml(file)
