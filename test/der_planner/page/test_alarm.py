@@ -90,7 +90,7 @@ def test_a_driver_that_ended_says_why_and_how_it_was_started(situation: Situatio
     process.kill()
     wait_for(lambda: alarms(situation), "the alarm")
     (alarm,) = alarms(situation)
-    assert f"its process has ended — {words}" in alarm["text"]
+    assert f"its process has ended — {words}. When last heard, the limb was" in alarm["text"]
     assert alarm["advice"].endswith("port:=/dev/mine")
     process.wait()
     situation.put_status(driver_at("elsewhere:1"))  # it was started again

@@ -100,21 +100,19 @@ def _between_runs(own: dict[str, dict[str, Any]]) -> bool:
 
 def _of_driver(snapshot: dict[str, Any], node: dict[str, Any] | None) -> Iterator[Alarm]:
     source, driver = snapshot["sources"]["driver"], snapshot["driver"]
+    dead = node is not None and node["state"] == "dead"
     if driver is None:
-        if node is None:
+        if node is not None and dead:
+            yield Alarm("danger", f"The driver is dead: {_reason(node)}", None, _restart(node))
+        elif node is None:
             yield Alarm("notice", "No driver is heard", None, "start it: " + start_of(DRIVER, None))
-            return
-    elif not source["fresh"] and node is not None and node["state"] == "ended":
+        return
+    if not source["fresh"] and node is not None and node["state"] == "ended":
         told = "The driver has been ended in order, and has vented the limb"
         yield Alarm("notice", told, None, "start it again: " + start_of(DRIVER, node))
         return
-    elif not source["fresh"]:
+    if dead or not source["fresh"]:
         yield Alarm("danger", *_silence(source, driver, node))
-        return
-    if node is not None and node["state"] == "dead":
-        since = None if driver is None else source["age"]
-        yield Alarm("danger", f"The driver is dead: {_reason(node)}", since, _restart(node))
-    if driver is None:
         return
     limb = describe_limb(driver)
     if driver["mode"] == "fault":
