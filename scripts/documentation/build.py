@@ -68,7 +68,7 @@ def main() -> int:
     parser.add_argument("--graph", action="store_true", help="write reference/graph.json anew")
     given = parser.parse_args()
     if given.graph:
-        graph.FILE.write_text(graph.text())
+        graph.FILE.write_text(graph.text(graph.FILE.read_text()))
     code = build(given.fresh)
     if code == 0 and given.external:
         code = sphinx("linkcheck")

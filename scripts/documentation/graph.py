@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import tempfile
+import time
 from pathlib import Path
 from typing import Any
 
@@ -27,19 +28,32 @@ OF_ROS = ("qos_overrides.", "start_type_description_service", "use_sim_time")
 BODIES = "pose_tracker"
 """A node that is not part of the experiment on the twin."""
 OF_EVERY_NODE = ("/rosout", "/parameter_events")
+PATIENCE = 20.0
+"""Time for which nodes may find each other's topics [s]."""
 
 
-def text() -> str:
-    """Start the graph on the twin and return what it says of itself, as JSON."""
+def text(kept: str) -> str:
+    """Start the graph on the twin and return what it says of itself, as JSON.
+
+    Nodes find each other one topic after the other: what differs from the kept text is asked again.
+    """
     folder = Path(tempfile.mkdtemp(prefix="graph_"))
     setup = GraphSetup(folder / "bag", {}, planner={}, page=0)
     given = {item.executable: item.parameters for item in setup.nodes("")}
     with GraphClient("reference") as client, running_graph(client, setup, folder, Progress()):
         bodies = NodeProcess("apriltag_tracker", BODIES, {}, folder)
         try:
-            found = {name: _node(client, name, given.get(name, {})) for name in [*given, BODIES]}
+            end = time.monotonic() + PATIENCE
+            said = _said(client, given)
+            while said != kept and time.monotonic() < end:
+                said = _said(client, given)
+            return said
         finally:
             bodies.stop()
+
+
+def _said(client: GraphClient, given: dict[str, dict[str, Any]]) -> str:
+    found = {name: _node(client, name, given.get(name, {})) for name in [*given, BODIES]}
     return json.dumps(found, indent=1, sort_keys=True) + "\n"
 
 
