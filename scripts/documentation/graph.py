@@ -28,6 +28,8 @@ OF_ROS = ("qos_overrides.", "start_type_description_service", "use_sim_time")
 BODIES = "pose_tracker"
 """A node that is not part of the experiment on the twin."""
 OF_EVERY_NODE = ("/rosout", "/parameter_events")
+WHILE_IT_STARTS = ("subscribes", topics.DIAGNOSTICS)
+"""Every node looks there for another one of its name; only the page goes on."""
 PATIENCE = 20.0
 """Time for which nodes may find each other's topics [s]."""
 
@@ -78,6 +80,7 @@ def _node(client: GraphClient, name: str, given: dict[str, Any]) -> dict[str, An
             topic.removeprefix(space + "/"): [kinds[0], _quality(info(topic), name)]
             for topic, kinds in pairs
             if topic not in OF_EVERY_NODE and "/_" not in topic
+            if name == "page" or (end, topic) != WHILE_IT_STARTS
         }
     services = node.get_service_names_and_types_by_node(name, space)
     found["services"] = {
