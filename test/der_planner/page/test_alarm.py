@@ -18,16 +18,6 @@ from der_planner.page.situation import DEAD, FRESH, Situation
 from limb_interfaces.diagnostics import ENDED_IN_ORDER
 
 
-@pytest.fixture
-def clock() -> Clock:
-    return Clock()
-
-
-@pytest.fixture
-def situation(clock: Clock) -> Situation:
-    return Situation(clock)
-
-
 def state(mode: int, measured: float = 0.0, **fields: Any) -> PressureState:
     return PressureState(
         mode=mode, measured_differential=[measured, 0.0], commanded_differential=[0.0, 0.0],

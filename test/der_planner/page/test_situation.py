@@ -20,16 +20,6 @@ from der_planner.page.situation import DEAD, FORGOTTEN, FRESH, LATE, MOST_NODES,
 from limb_interfaces.stamps import stamp_from_nanoseconds
 
 
-@pytest.fixture
-def clock() -> Clock:
-    return Clock()
-
-
-@pytest.fixture
-def situation(clock: Clock) -> Situation:
-    return Situation(clock)
-
-
 def driver(mode: int = 5) -> PressureState:
     nan = float("nan")
     return PressureState(

@@ -447,8 +447,10 @@ class BendFit:
         """
         unknowns = self.free.unknowns
         columns, errors = [], []
-        for log in self._logs:
-            part = predicted(self.free, self._model, log, values)
+        found = self._predicted(values)
+        if found is None:
+            raise RuntimeError("the model cannot follow the logs")
+        for log, part in zip(self._logs, found, strict=True):
             speed = np.gradient(part.angles, log.log.time, axis=0)
             slopes = part.angles_by[log.usable].reshape(-1, len(values)) * unknowns.scale
             columns.append(np.column_stack([-speed[log.usable].ravel(), slopes]))
