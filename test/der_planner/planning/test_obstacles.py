@@ -1,10 +1,15 @@
 """Things in the way: the clearance of a motion, the force of a touch, and what is refused."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from der_planner.limb import Limb
+from der_planner.model import RodModel
 from der_planner.planning import Motion, ObstacleError, Obstacles, PlanningError, plan
+from der_planner.planning.configuration import configure
+from der_planner.planning.workspace import Workspace
 
 LIMB = Limb.default()
 MOTION = Motion.named("same_direction", amplitude=0.4, period=4.0, cycles=1)
@@ -44,6 +49,33 @@ def test_a_motion_into_a_peg_is_refused_with_instant_place_and_clearance(free, s
     with pytest.raises(ObstacleError):
         plan(LIMB, MOTION, method="projected", obstacles=circle(point, allowed=0.9 * error.force))
     plan(LIMB, MOTION, method="projected", obstacles=circle(point, allowed=1.1 * error.force))
+
+
+@pytest.mark.parametrize("mounting", ["horizontal", "sideways"])
+def test_the_optimal_plan_leads_the_limb_past_what_it_cannot_touch(mounting):
+    limb = LIMB.mounted(mounting)
+    model = RodModel(limb)
+
+    def curves(reference):
+        return configure(model, reference).curves(reference.time)
+
+    reference = MOTION.reference(Workspace(model))
+    poses = curves(reference)
+    k = int(np.argmax(reference.bend_angles.sum(axis=1)))
+    node = round(0.8 * (len(poses[k]) - 1))
+    along = poses[k, node + 1] - poses[k, node - 1]
+    left = np.array([-along[1], along[0]]) / np.linalg.norm(along)
+    way = circle(poses[k, node] + left * (RADIUS + 0.01 - 0.006))
+    found = plan(limb, MOTION, obstacles=way)
+    past = curves(dataclasses.replace(reference, tip=found.tip_reference))
+    assert way.nearest(way.items[0], poses).clearance == pytest.approx(-0.006, abs=1e-3)
+    assert way.nearest(way.items[0], past).clearance > 0.0
+    # It leaves the path only beside the peg, by about what it would have run into it.
+    left_by = np.linalg.norm(found.tip_reference - reference.tip, axis=1)
+    assert 0.0 < left_by.max() < 0.012
+    assert np.median(left_by) < 1e-3
+    assert "leads the tip" in " ".join(found.warnings)
+    assert np.linalg.norm(found.tip_predicted - found.tip_reference, axis=1).mean() < 5e-4
 
 
 def edge(y, normal):

@@ -10,7 +10,7 @@ from scipy.optimize import brentq
 
 from der_planner.limb import PointMass, gravity_of
 from der_planner.twin import LimbTwin, Push, TwinError
-from der_planner.twin.body import AXIAL_STIFFNESS, SHEAR_STIFFNESS
+from der_planner.twin.body import AXIAL_STIFFNESS, RADIUS, SHEAR_STIFFNESS
 from der_planner.twin.limb_twin import ATMOSPHERE
 from der_planner.twin.offline import play
 
@@ -124,6 +124,31 @@ def test_gravity_across_the_plane_sags_the_limb_out_of_it():
     # Round limbs are as stiff one way as the other.
     assert twin._rod.position_collection[2, -1] == pytest.approx(level.tip[1], rel=0.02)
     assert twin.tip[1] == 0.0
+
+
+def test_a_peg_holds_the_limb_with_the_force_that_would_hold_it_there():
+    pressure = REST + 6e3 * np.array([1.0, 0.0, 1.0, 0.0])
+    free, held, pushed = (LimbTwin(hardware=elastic(drag=8.0)) for _ in range(3))
+    free.step(pressure, 3.0)
+    # Amid an element: contact is shared between its nodes by halves, wherever it is.
+    arc = free._node_arc[13:15].mean()
+    place = int(np.argmin(np.abs(free.shape().arc_length - arc)))
+    shape, radius = free.shape(), 0.01
+    normal = np.array([-math.sin(shape.heading[place]), math.cos(shape.heading[place])])
+    held.put_pegs([*(shape.points[place] + (RADIUS + radius - 0.008) * normal), radius])
+    held.step(pressure, 3.0)
+    clearance = np.linalg.norm(held.shape(400).points - held._pegs.centre[0, :2], axis=1).min()
+    assert clearance == pytest.approx(RADIUS + radius, abs=2e-4)
+    assert held.touch @ normal < -0.1
+    # What presses at that place instead of the peg leads to the same shape.
+    near = held.shape(400)
+    touched = np.argmin(np.linalg.norm(near.points - held._pegs.centre[0, :2], axis=1))
+    pushed.push(Push(0.0, near.arc_length[touched], (*held.touch, 0.0)))
+    pushed.step(pressure, 3.0)
+    moved = np.linalg.norm(free.tip - held.tip)
+    assert np.linalg.norm(pushed.tip - held.tip) < 0.03 * moved
+    with pytest.raises(TwinError, match="stands where the limb"):
+        free.put_pegs([0.1, 0.0, 0.01])
 
 
 @pytest.mark.parametrize(

@@ -54,6 +54,7 @@ def play_on_graph(run: TrialRun, progress: Progress) -> dict[str, Any]:
         planner=_planner_parameters(run),
         record_images=options.record_images,
         poses=options.poses,
+        obstacles=options.in_the_way,
     )
     drawn = options.path if run.learned is None else None
     asked = _path(drawn) if drawn is not None else _command(run)
@@ -114,6 +115,7 @@ def _planner_parameters(run: TrialRun) -> dict[str, Any]:
         "payload": options.loads.payload,
         "payload_at": options.loads.payload_at or 0.0,
         "feedback": trial.feedback,
+        "obstacles": str(options.obstacles or ""),
     }
     if run.learned is not None:
         parameters["learned_plans"] = str(run.learned.parent)

@@ -77,6 +77,8 @@ def _play(planned: Plan, run: TrialRun) -> tuple[Played, dict[str, Any]]:
         gravity=limb.gravity,
         masses=limb.masses,
     )
+    if (obstacles := run.options.in_the_way) is not None:
+        plant.twin.put_pegs(obstacles.circles)
     plant.rest(_AT_REST)
     feedback = Feedback(planned) if trial.feedback else None
     played = lockstep.play(planned, plant, feedback, lockstep.Sensors(seed=trial.seed))

@@ -18,7 +18,7 @@ from der_planner.experiment.processes import Hardware
 from der_planner.limb import Limb
 from der_planner.methods import LEARNED
 from der_planner.planning import METHODS as METHODS_BY_MODEL
-from der_planner.planning import Motion, Plan, PlanningError, plan
+from der_planner.planning import Motion, Obstacles, Plan, PlanningError, plan
 from der_planner.planning.motions import (
     DEFAULT_AMPLITUDE,
     DEFAULT_CYCLES,
@@ -135,6 +135,12 @@ class Options:
     )
     loads: Loads = field(default_factory=Loads)
     board: str = _option(BOARDS[0], f"of the twin: of {', '.join(BOARDS)}", metavar="BOARD")
+    obstacles: Path | None = _option(
+        None,
+        "what is in the limb's way (YAML): plans keep off it, and the twin runs into it",
+        type=Path,
+        metavar="FILE",
+    )
     hardware: Hardware | None = _option(
         None, "a real valve board and camera instead of the twin", type=Path, metavar="FILE"
     )
@@ -176,6 +182,15 @@ class Options:
             return Motion.from_csv(self.path, nearest=self.nearest)
         return Motion.named(name, amplitude=self.amplitude, period=self.period, cycles=self.cycles)
 
+    @property
+    def in_the_way(self) -> Obstacles | None:
+        """What is in the limb's way.
+
+        Raises:
+            PlanningError: the file cannot be used.
+        """
+        return Obstacles.from_yaml(self.obstacles) if self.obstacles else None
+
     def plan_of_trials(self) -> list[Trial]:
         """Return every trial in the order in which they are played."""
         return [
@@ -211,8 +226,10 @@ class TrialRun(NamedTuple):
         Raises:
             PlanningError: it cannot be planned.
         """
-        motion = self.options.motion(self.trial.motion)
-        return plan(self.limb, motion, model=self.trial.model, method=self.trial.method)
+        motion, trial = self.options.motion(self.trial.motion), self.trial
+        return plan(
+            self.limb, motion, trial.model, trial.method, obstacles=self.options.in_the_way
+        )
 
 
 def parser() -> argparse.ArgumentParser:
@@ -306,9 +323,15 @@ def parse(arguments: Sequence[str]) -> Options:
         values |= {"amplitude": 0.0, "period": 0.0, "cycles": 1, "path": given.path.resolve()}
     out = given.out or Path("experiments") / time.strftime("%Y-%m-%d_%H-%M-%S")
     values["out"] = out.resolve()
-    if given.library is not None:
-        values["library"] = given.library.resolve()
-    return Options(**values)
+    for name in ("library", "obstacles"):
+        if values[name] is not None:
+            values[name] = values[name].resolve()
+    options = Options(**values)
+    try:
+        options.in_the_way  # noqa: B018 - it is read
+    except PlanningError as error:
+        raise OptionError(f"--obstacles: {error}") from error
+    return options
 
 
 def _motions(given: argparse.Namespace) -> tuple[str, ...]:

@@ -21,6 +21,7 @@ import yaml
 
 from der_planner.experiment.console import OptionError
 from der_planner.limb import Limb
+from der_planner.planning import Obstacles
 
 STOP_ORDER = (
     "planner",
@@ -162,6 +163,7 @@ class GraphSetup:
         page: port of the operator's page; None for a graph without one.
         poses: simulated motion capture in place of the twin's camera.
         wiring: of the twin, as its parameter; None: as everybody expects.
+        obstacles: in the twin's way.
     """
 
     bag: Path
@@ -176,6 +178,7 @@ class GraphSetup:
     page: int | None = None
     poses: bool = False
     wiring: tuple[int, ...] | None = None
+    obstacles: Obstacles | None = None
 
     def nodes(self, port: str) -> list[NodeSpec]:
         """Return the nodes in the order in which they start; the emulated board is at ``port``."""
@@ -196,6 +199,8 @@ class GraphSetup:
             specs.insert(0, NodeSpec("pressure_driver", "board_emulator", board))
             if self.wiring is not None:
                 twin["wiring"] = list(self.wiring)
+            if self.obstacles is not None:
+                twin["pegs"] = self.obstacles.circles.ravel().tolist()
             camera = NodeSpec("apriltag_tracker", "synthetic_camera", {"seed": self.seed})
             if self.poses:
                 poses = {"form": "pose_array"}

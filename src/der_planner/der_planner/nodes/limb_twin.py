@@ -89,7 +89,15 @@ class LimbTwinNode(Node):
         x, y, z = map(float, gravity)
         both = zip(masses, places, strict=True)
         carried = [PointMass(float(at), float(mass)) for mass, at in both]
-        return LimbTwin(seed, run, gravity=(x, y, z), masses=carried)
+        pegs = read(
+            "pegs", [0.0], "round things in the limb's way: x, y, radius of each [m]; 0: nothing"
+        )  # fmt: skip
+        twin = LimbTwin(seed, run, gravity=(x, y, z), masses=carried)
+        if any(pegs):
+            if len(pegs) % 3:
+                raise TwinError(f"parameter 'pegs' must be x, y, radius of each, got {pegs}")
+            twin.put_pegs(pegs)
+        return twin
 
     def close(self) -> None:
         """Stop the physics before the publishers go."""

@@ -10,7 +10,7 @@ A file names circles and half-planes in `limb_base`, in metres and newtons:
 The clearance of a pose is the distance of its centreline from an obstacle less both radii. Where it
 is negative, the limb does not come so far: what does not move pushes it back by that much, with the
 force that the compliance there gives, f = −clearance / (nᵀ C_p n). A motion for which this is more
-than an obstacle allows is refused.
+than an obstacle allows is refused, or, by the method ``optimal``, led past it first (`led_past`).
 """
 
 from __future__ import annotations
@@ -23,6 +23,8 @@ from typing import Any
 
 import numpy as np
 import yaml
+from scipy.ndimage import gaussian_filter1d
+from scipy.optimize import minimize
 
 from der_planner.arrays import Array
 from der_planner.model import RodModel
@@ -33,6 +35,14 @@ _CIRCLE = {"circle_m", "radius_m", "allowed_force_n"}
 _HALF_PLANE = {"half_plane_m", "normal", "allowed_force_n"}
 _FINE = 4
 """Points a piece of the centreline between two nodes."""
+_LARGE = 100.0
+"""Radius of a circle whose edge is straight beside a limb [m]."""
+_MARGIN = 1.5e-3
+"""Distance that poses which are led past keep beside what is allowed [m]."""
+_SMOOTHED = 4.0
+"""Standard deviation, in poses, by which the way past is smoothed: it would begin with a kink."""
+_NEARNESS = 1e-3
+"""Tip error that a unit change of a bend angle is worth there [m/rad]."""
 
 
 @dataclass(frozen=True)
@@ -147,6 +157,17 @@ class Obstacles:
         items = tuple(_obstacle(item) for item in content["obstacles"])
         return Obstacles(_number(content["limb_radius_m"], "limb_radius_m"), items)
 
+    @property
+    def circles(self) -> Array:
+        """(P, 3) centre and radius of each [m]; a half-plane is a circle that is large enough."""
+        rows = [
+            (*each.point, each.radius)
+            if each.radius is not None
+            else (*(each.point - _LARGE * each.normal), _LARGE)
+            for each in self.items
+        ]
+        return np.array(rows).reshape(-1, 3)
+
     def nearest(self, obstacle: Obstacle, curves: Array) -> Nearest:
         """Return where poses come nearest to an obstacle.
 
@@ -179,12 +200,76 @@ class Obstacles:
             found = self.nearest(obstacle, curves)
             if found.clearance >= 0.0:
                 continue
-            limp = compliance(model, bend_angles[found.index], [found.place])
-            slack = float(found.out @ limp.place[0] @ found.out)
+            slack = _slack(model, bend_angles[found.index], found)
             force = -found.clearance / slack if slack > 0.0 else math.inf
             if force > obstacle.allowed_force:
                 instant = float(time[found.index])
                 raise ObstacleError(instant, found.place, found.clearance, force, obstacle)
+
+    def led_past(self, model: RodModel, curves: Array, bend_angles: Array) -> Array:
+        """Return by how much the tip is led aside (K, 2) [m] to keep off what is in the way.
+
+        A pose that would touch with more force than is allowed is moved: its bend angles minimise
+        the tip's distance, with every obstacle as far away as it must be.
+
+        Args:
+            model: rod of the limb.
+            curves: (K, P, 2) centrelines of the poses [m].
+            bend_angles: (K, M) of them [rad].
+        """
+        moved, change = np.zeros((len(curves), 2)), np.zeros(bend_angles.shape[1])
+        for k, (curve, bend) in enumerate(zip(curves, bend_angles, strict=True)):
+            near = [self.nearest(each, curve[None]) for each in self.items]
+            least = np.array(
+                [
+                    _MARGIN - each.allowed_force * _slack(model, bend, found)
+                    for each, found in zip(self.items, near, strict=True)
+                ]
+            )
+            if all(found.clearance >= 0.0 for found in near):
+                change = np.zeros_like(change)
+                continue
+            change = self._aside(model, curve, bend, least, change)
+            moved[k] = model.kinematics.tip(bend + change) - model.kinematics.tip(bend)
+        smooth: Array = gaussian_filter1d(moved, _SMOOTHED, axis=0, mode="nearest")
+        return smooth
+
+    def _aside(
+        self, model: RodModel, curve: Array, bend: Array, least: Array, guess: Array
+    ) -> Array:
+        """Return the change (M,) of a pose's bend angles [rad] that leads it past.
+
+        Args:
+            model: rod of the limb.
+            curve: (P, 2) centreline of the pose [m].
+            bend: (M,) of it [rad].
+            least: of the clearances of the obstacles [m].
+            guess: the search begins there.
+        """
+        even = model.kinematics
+        start, tip = even.curve(bend), even.tip(bend)
+
+        def clearances(change: Array) -> Array:
+            moved = curve + even.curve(bend + change) - start
+            return np.array([self.nearest(each, moved[None]).clearance for each in self.items])
+
+        def cost(change: Array) -> float:
+            left = even.tip(bend + change) - tip
+            return float(left @ left + _NEARNESS**2 * change @ change) * 1e4
+
+        found = minimize(
+            cost,
+            guess,
+            method="SLSQP",
+            constraints={"type": "ineq", "fun": lambda change: (clearances(change) - least) * 1e2},
+        )
+        return np.asarray(found.x, dtype=float)
+
+
+def _slack(model: RodModel, bend: Array, found: Nearest) -> float:
+    """Return how far a pose with bend angles (M,) gives way to a force out of an obstacle [m/N]."""
+    limp = compliance(model, bend, [found.place])
+    return float(found.out @ limp.place[0] @ found.out)
 
 
 def _obstacle(item: Any) -> Obstacle:

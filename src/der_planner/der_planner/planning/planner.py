@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time as clock
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from threadpoolctl import ThreadpoolController
@@ -26,6 +27,8 @@ from der_planner.rod import ConvergenceError
 _THREADS = ThreadpoolController()
 _FINE = 2
 """Points of the balance's grid a control period."""
+_ROUNDS = 6
+"""A reference is led past what is in the way so often at most."""
 _NOTABLE_CUT = 20.0
 """Cuts by limits are worth a warning from here on [Pa]."""
 _NOTABLE_OPPOSITE = 1000.0
@@ -57,7 +60,8 @@ def plan(
         nodes: of the rod.
         start: where another motion is left; None: where the vented limb rests.
         progress: called with the share that is done, 0 … 1.
-        obstacles: in the way of the limb; None: nothing.
+        obstacles: in the way of the limb; None: nothing. The method ``optimal`` of the rod leaves
+            the path where it must to keep off them; the plan's reference is the path past them.
 
     The plan's `warnings` say where limits cut the wanted pressures, and where the limb's numbers
     are those of another mounting.
@@ -77,11 +81,11 @@ def plan(
         rod = RodModel(limb, nodes)
         body = rod if model == "der" else Model.of(limb, model)
         reference = motion.reference(Workspace(rod), start)
-        configuration = configure(body, reference)
-        bend = configuration.bend_at(reference.time)
+        configuration, led = configure(body, reference), ""
         if obstacles is not None:
-            curves = configuration.curves(reference.time)
-            obstacles.check(rod, reference.time, curves, bend)
+            rounds = _ROUNDS if model == "der" and method == "optimal" else 0
+            configuration, led, reference = _past(obstacles, rod, configuration, reference, rounds)
+        bend = configuration.bend_at(reference.time)
         report(0.3)
         try:
             # The optimum begins from the projected balance.
@@ -98,6 +102,7 @@ def plan(
         str(reference.deviation or ""),
         seen.other_mounting,
         nearly_buckling(seen),
+        led,
         *_limit_warnings(configuration, reference, wanted, slow, found, method),
         _error_warning(found.tip, reference, method),
         _calibration_warning(seen, bend),
@@ -135,6 +140,37 @@ def _solve(
     air, before = configuration.model.air, configuration.initial.before
     commands, cut = within_limits(wanted, air, CONTROL_PERIOD, before)
     return Optimum(commands, tip_under(configuration, commands), 0, int(cut > _NOTABLE_CUT))
+
+
+def _past(
+    obstacles: Obstacles,
+    rod: RodModel,
+    configuration: Configuration,
+    reference: Reference,
+    rounds: int,
+) -> tuple[Configuration, str, Reference]:
+    """Lead a reference past what is in the way; return its configuration, a warning, and itself.
+
+    A limb that sags does not move as an evenly bent one: what is left is led past again.
+
+    Raises:
+        ObstacleError: the limb would run into an obstacle all the same.
+    """
+    path, led, time = reference.tip, "", reference.time
+    for more in range(rounds, -1, -1):
+        curves, bend = configuration.curves(time), configuration.bend_at(time)
+        aside = obstacles.led_past(rod, curves, bend) if more else np.zeros_like(path)
+        if not aside.any():
+            break
+        reference = replace(reference, tip=reference.tip + aside)
+        configuration = configure(configuration.model, reference)
+        off = np.linalg.norm(reference.tip - path, axis=1)
+        led = (
+            f"what is in the way leads the tip up to {off.max() * 1000:.1f} mm off its path, at "
+            f"{time[off.argmax()]:.1f} s; errors count from the path past it"
+        )
+    obstacles.check(rod, time, curves, bend)
+    return configuration, led, reference
 
 
 def choose_method(model: str, method: str) -> str:

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 from elastica._calculus import difference_kernel_for_block_structure
+from elastica._contact_functions import _calculate_contact_forces_rod_sphere
 from elastica._linalg import _batch_matvec
 from elastica.rod.cosserat_rod import (
     _compute_bending_twist_strains,
@@ -27,6 +28,10 @@ from numpy.typing import NDArray
 import der_planner.rod.compile  # noqa: F401 - drops caches that are older than this source
 from der_planner.arrays import Array
 
+CONTACT_STIFFNESS = 1e4
+"""Of a peg [N/m]: 1 N presses the limb 0.1 mm into it."""
+CONTACT_DAMPING = 5.0
+"""Of a peg [N·s/m]."""
 VISCOUS_TIME = 1e-4
 """τ of the material's own damping [s], a loss factor ω τ of 0.02 at the lowest axial mode (37 Hz)
 and of 0.4 at the mesh's highest. Without it these modes would ring on, reverse the bend all the
@@ -96,6 +101,14 @@ class SectionMaterial(NamedTuple):
     rest_stretch: Array  # (E,) strain at rest [-]
 
 
+class Pegs(NamedTuple):
+    """Round things that stand in the plane of the limb and do not move."""
+
+    centre: Array  # (P, 3) [m]
+    radius: Array  # (P,) [m]
+    force: Array  # (P, 3, 1) by which the limb presses on each, at the last step [N]
+
+
 class Ramp(NamedTuple):
     """What the chambers change in each of the next steps, until they hold their new pressure."""
 
@@ -143,7 +156,13 @@ def bending_law(material: SectionMaterial, kappa: Array, couple: Array, dt: floa
 
 @njit(cache=True)
 def advance(
-    rod: RodArrays, material: SectionMaterial, ramp: Ramp, steps: int, dt: float, drag: float
+    rod: RodArrays,
+    material: SectionMaterial,
+    ramp: Ramp,
+    pegs: Pegs,
+    steps: int,
+    dt: float,
+    drag: float,
 ) -> None:
     """Advance the limb by ``steps`` position Verlet steps of ``dt`` [s].
 
@@ -151,6 +170,7 @@ def advance(
         rod: changed in place; its first element is clamped.
         material: changed in place.
         ramp: how the material changes with the pressures from the first step on.
+        pegs: in the way; their forces are changed in place.
         steps: number of steps.
         dt: [s] below the stability limit of the stiffest mode.
         drag: mass-proportional damping [1/s], integrated exactly.
@@ -158,7 +178,7 @@ def advance(
     keep = np.exp(-drag * dt)
     vertices = rod.kappa.shape[1]
     moment = np.zeros(vertices)
-    strain = rod.sigma.copy()
+    strain, loads = rod.sigma.copy(), rod.external_forces.copy()
     for step in range(steps):
         if step < ramp.steps:
             material.active[:] += ramp.active
@@ -174,10 +194,36 @@ def advance(
             # PyElastica's couple is B (κ − κ_rest): this rest curvature makes it the law's moment.
             rod.rest_kappa[0, k] = rod.kappa[0, k] - moment[k] / rod.bend_matrix[0, 0, k]
         _internal_forces(rod, material, strain, dt)
+        _press(rod, pegs)
         _accelerations(rod)
+        rod.external_forces[:] = loads
         _kick(rod, dt, keep)
         overload_operator_kinematic_numba(
             0.5 * dt, rod.position, rod.directors, rod.velocity, rod.omega
+        )
+
+
+@njit(cache=True)
+def _press(rod: RodArrays, pegs: Pegs) -> None:
+    """Add what pegs press on the limb to its external forces, by PyElastica's contact, smooth."""
+    still, edges = np.zeros((3, 1)), rod.tangents * rod.lengths
+    first = np.ascontiguousarray(rod.position[:, :-1])
+    for p in range(len(pegs.radius)):
+        pegs.force[p] = 0.0
+        _calculate_contact_forces_rod_sphere(
+            first,
+            edges,
+            pegs.centre[p],
+            rod.radius + pegs.radius[p],
+            rod.lengths + rod.radius,
+            rod.external_forces,
+            pegs.force[p],
+            rod.velocity,
+            still,
+            CONTACT_STIFFNESS,
+            CONTACT_DAMPING,
+            0.0,
+            0.0,
         )
 
 

@@ -8,12 +8,13 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from der_planner.arrays import Array
 from der_planner.limb import PointMass
-from der_planner.twin.body import NodeLoads, Push, TwinError, build
+from der_planner.twin.body import RADIUS, NodeLoads, Push, TwinError, build
 from der_planner.twin.hardware import DrawnHardware, draw
-from der_planner.twin.kernel import Ramp, advance
+from der_planner.twin.kernel import Pegs, Ramp, advance
 
 ATMOSPHERE = 101_325.0
 """Absolute pressure outside the chambers [Pa]."""
@@ -88,6 +89,7 @@ class LimbTwin:
         self._pressure = np.full(2 * self.segment_count, self.atmosphere)
         self._ramp_left = 0
         self._wander_noise = np.random.default_rng([7_919, seed, run])
+        self._pegs = Pegs(np.empty((0, 3)), np.empty(0), np.empty((0, 3, 1)))
         body = build(self._hardware)
         rod = self._rod = body.rod
         self._arrays, self._material = body.arrays, body.material
@@ -142,7 +144,8 @@ class LimbTwin:
         self._ramp_left = max(0, self._ramp_left - steps)
         while steps:
             count = min(steps, self._steps_to(self._loads.next_change(self.time)))
-            advance(self._arrays, self._material, ramp, count, TIME_STEP, self._hardware.drag)
+            drag = self._hardware.drag
+            advance(self._arrays, self._material, ramp, self._pegs, count, TIME_STEP, drag)
             ramp = ramp._replace(steps=max(0, ramp.steps - count))
             steps -= count
             self.time += count * TIME_STEP
@@ -158,6 +161,32 @@ class LimbTwin:
         """
         self._loads.add(push)
         self._loads.update(self.time)
+
+    def put_pegs(self, pegs: ArrayLike) -> None:
+        """Put round things that do not move in the limb's way, in place of those before.
+
+        Args:
+            pegs: (P, 3) x, y and radius of each [m].
+
+        Raises:
+            TwinError: a peg stands where the limb is.
+        """
+        x, y, radius = np.asarray(pegs, dtype=float).reshape(-1, 3).T
+        centre = np.stack([x, y, np.zeros_like(x)], axis=1)
+        points = self.shape(200).points
+        for peg, size in zip(centre[:, :2], radius, strict=True):
+            if np.linalg.norm(points - peg, axis=1).min() < RADIUS + size:
+                raise TwinError(
+                    f"a peg of {size:g} m at ({peg[0]:g}, {peg[1]:g}) m stands where the limb of "
+                    f"radius {RADIUS:g} m is"
+                )
+        self._pegs = Pegs(centre, np.ascontiguousarray(radius), np.zeros((len(centre), 3, 1)))
+
+    @property
+    def touch(self) -> Array:
+        """(2,) force of all pegs on the limb [N]."""
+        force: Array = -self._pegs.force.sum(axis=0)[:2, 0]
+        return force
 
     def shape(self, points: int = 0) -> TwinShape:
         """Return the true centreline.
@@ -243,7 +272,7 @@ class LimbTwin:
         rest = np.full(2 * self.segment_count, self.atmosphere)
         steps = int(2.0 / TIME_STEP)
         ramp = self._ramp(self._target(rest, 0.0), steps // 4)
-        advance(self._arrays, self._material, ramp, steps, TIME_STEP, _SETTLING_DRAG)
+        advance(self._arrays, self._material, ramp, self._pegs, steps, TIME_STEP, _SETTLING_DRAG)
         self._stop()
 
     def _settle_under_loads(self) -> None:
@@ -261,7 +290,7 @@ class LimbTwin:
         ramp = self._ramp(self._target(rest, 0.0), 0)
         steps = round(0.5 / TIME_STEP)
         for _ in range(round(_LONGEST_SETTLING / (steps * TIME_STEP))):
-            advance(self._arrays, calm, ramp, steps, TIME_STEP, _SETTLING_DRAG)
+            advance(self._arrays, calm, ramp, self._pegs, steps, TIME_STEP, _SETTLING_DRAG)
             if np.abs(self._rod.velocity_collection).max() < _SETTLED_SPEED:
                 break
         self._stop()
