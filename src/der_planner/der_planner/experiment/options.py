@@ -227,9 +227,7 @@ class TrialRun(NamedTuple):
             PlanningError: it cannot be planned.
         """
         motion, trial = self.options.motion(self.trial.motion), self.trial
-        return plan(
-            self.limb, motion, trial.model, trial.method, obstacles=self.options.in_the_way
-        )
+        return plan(self.limb, motion, trial.model, trial.method, obstacles=self.options.in_the_way)
 
 
 def parser() -> argparse.ArgumentParser:

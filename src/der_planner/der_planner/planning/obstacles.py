@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 import yaml
 from scipy.ndimage import gaussian_filter1d
-from scipy.optimize import minimize
+from scipy.optimize import NonlinearConstraint, minimize
 
 from der_planner.arrays import Array
 from der_planner.model import RodModel
@@ -255,14 +255,11 @@ class Obstacles:
 
         def cost(change: Array) -> float:
             left = even.tip(bend + change) - tip
-            return float(left @ left + _NEARNESS**2 * change @ change) * 1e4
+            return 1e4 * float(left @ left + _NEARNESS**2 * change @ change)
 
-        found = minimize(
-            cost,
-            guess,
-            method="SLSQP",
-            constraints={"type": "ineq", "fun": lambda change: (clearances(change) - least) * 1e2},
-        )
+        # In centimetres, as the solver's tolerances mean it.
+        keep_off = NonlinearConstraint(lambda c: 100 * clearances(c), 100 * least, np.inf)
+        found = minimize(cost, guess, method="SLSQP", constraints=keep_off)
         return np.asarray(found.x, dtype=float)
 
 
