@@ -35,7 +35,7 @@
     alarms.forEach((alarm, index) => {
       const line = place.children[index] ?? place.appendChild(document.createElement("div"));
       const since = alarm.since == null ? "" : ` (for ${ago(alarm.since + Math.max(silence, 0))})`;
-      const advice = alarm.advice ? ` → ${alarm.advice[0].toUpperCase()}${alarm.advice.slice(1)}.` : "";
+      const advice = alarm.advice ? ` → ${alarm.advice[0].toUpperCase()}${alarm.advice.slice(1)}` : ""; // no full stop: it may end with a command
       const full = alarm.text.endsWith("…") || alarm.text.endsWith(".") ? "" : ".";
       put(line, `${alarm.text}${since}${full}${advice}`); // as text, never as HTML
       if (line.className !== alarm.level) line.className = alarm.level;
