@@ -35,6 +35,7 @@ const top = page.drawing.region[0].reduce((best, point) => (point[1] < best[1] ?
 return [box.left + top[0] * box.width / width, box.top + top[1] * box.height / height];
 """
 """Where the reachable region is highest, in the window."""
+LIVE = "return !document.body.matches('.lost') && !document.querySelector('#view.old-title')"
 RING = 17
 """[px] Radius of the drawn ring in the window."""
 POINTS = 24
@@ -61,8 +62,10 @@ class Photographer:
         self.window.execute_cdp_cmd("Emulation.setTouchEmulationEnabled", touched)
         self.graph.client.spin(SETTLING)
 
-    def take(self, name: str) -> None:
-        """Write what the window shows."""
+    def take(self, name: str, live: bool = True) -> None:
+        """Write what the window shows; ``live``: once its data are not old."""
+        if live:
+            self.wait(LIVE, "live data")
         picture = Image.open(BytesIO(self.window.get_screenshot_as_png()))
         save(picture, self._folder / name)
         print(self._folder / name, flush=True)
@@ -133,7 +136,7 @@ def draw_states(photographer: Photographer) -> None:
     def take(state: str) -> None:
         for name, screen in SCREENS.items():
             photographer.resize(screen)
-            photographer.take(f"page_{state}_{name}.png")
+            photographer.take(f"page_{state}_{name}.png", live=state != "page_dead")
         photographer.resize(DESKTOP)
 
     def says(words: str) -> None:

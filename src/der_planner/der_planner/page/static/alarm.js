@@ -9,7 +9,9 @@
   page.onState.push((silence, lost, unheard) => {
     const driver = page.ageOf("driver") === null ? null : page.data.driver;
     const old = lost || page.isOld("driver");
-    showAlarms(lost ? [ofServer(silence, unheard, driver)] : page.data?.alarms ?? [], silence);
+    const known = page.data?.alarms ?? [], slow = lost && page.data && unheard <= SLOW;
+    if (slow) showAlarms([...known, ofServer(silence, unheard, driver)], silence); // what is dead stays so
+    else showAlarms(lost ? [ofServer(silence, unheard, driver)] : known, silence);
     showState(driver, old);
   });
 
