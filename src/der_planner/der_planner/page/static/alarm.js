@@ -56,6 +56,9 @@
     if (driver && !known) meaning = `${ago(page.ageOf("driver"))} ago: ${driver.mode}, ${page.data.limb_is}`;
     put(find("meaning"), meaning);
     put(find("figures"), known ? figures(driver) : "");
+    const failed = find("vent-notice"); // of a vent that the limb has taken after all
+    const vented = known && driver.mode === "disarmed" && page.data.limb_is === "without pressure";
+    if (vented && failed.className === "danger") failed.hidden = true;
   }
 
   // Present numbers: pressures, tip error, progress of the plan.
