@@ -179,6 +179,19 @@ def test_the_action_tells_how_it_goes_and_how_it_ended(planner):
     assert len(node.received("cut")) < len(node.wait_plan("cut").time)
 
 
+def goal_result(client, action):
+    """Send a goal, and return what comes of it."""
+    from der_msgs.action import PlayMotion
+    from der_msgs.msg import MotionCommand
+
+    command = MotionCommand(motion="asynchronous", amplitude=0.3, period=60.0, cycles=1)
+    sent = action.send_goal_async(PlayMotion.Goal(command=command))
+    client.wait_for(sent.done, 30.0, "the goal to be accepted")
+    answer = sent.result().get_result_async()
+    client.wait_for(answer.done, 30.0, "the result")
+    return answer.result().result
+
+
 def test_a_plan_belongs_to_the_arming_in_which_it_was_asked_for(planner):
     """Asked for while disarmed, by topic or action, it is refused at once and never plays.
 
@@ -187,7 +200,7 @@ def test_a_plan_belongs_to_the_arming_in_which_it_was_asked_for(planner):
     from rclpy.action import ActionClient
 
     from der_msgs.action import PlayMotion
-    from der_msgs.msg import MotionCommand, PressureState
+    from der_msgs.msg import PressureState
     from limb_interfaces import qos, topics
 
     node = planner()
@@ -203,14 +216,6 @@ def test_a_plan_belongs_to_the_arming_in_which_it_was_asked_for(planner):
     def hears(name):
         client.wait_for(lambda: node.state()["driver"] == name, 30.0, f"the planner to hear {name}")
 
-    def ask():
-        command = MotionCommand(motion="asynchronous", amplitude=0.3, period=60.0, cycles=1)
-        sent = action.send_goal_async(PlayMotion.Goal(command=command))
-        client.wait_for(sent.done, 30.0, "the goal to be accepted")
-        answer = sent.result().get_result_async()
-        client.wait_for(answer.done, 30.0, "the result")
-        return answer.result().result
-
     ticking = client.node.create_timer(0.05, tick)
     hears("DISARMED")
     node.command(plan_id="early", period=60.0)
@@ -218,7 +223,7 @@ def test_a_plan_belongs_to_the_arming_in_which_it_was_asked_for(planner):
     client.wait_for(lambda: refused in node.state()["last_refusal"], 30.0, "the refusal")
     action = ActionClient(client.node, PlayMotion, "planner/play_motion")
     client.wait_for(action.server_is_ready, 30.0, "the action")
-    result = ask()
+    result = goal_result(client, action)
     assert result.outcome == "refused"
     assert "DISARMED" in result.reason
 
@@ -243,7 +248,7 @@ def test_a_plan_belongs_to_the_arming_in_which_it_was_asked_for(planner):
     node.command(plan_id="silent", period=600.0)
     refused = "silent: the driver has said nothing for"
     client.wait_for(lambda: refused in node.state()["last_refusal"], 30.0, "the refusal")
-    result = ask()
+    result = goal_result(client, action)
     assert result.outcome == "refused"
     log = node.process.log.read_text()
     assert "plan silent accepted" not in log
