@@ -7,9 +7,12 @@ from __future__ import annotations
 
 import argparse
 import math
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 from urllib.parse import urljoin
+
+from PIL import Image, ImageDraw
 
 from benchmarks.page import PageGraph, page_graph
 from der_msgs.msg import PressureState
@@ -21,6 +24,8 @@ DESKTOP = {"width": 1280, "height": 800, "deviceScaleFactor": 1, "mobile": False
 TABLET = {"width": 820, "height": 1180, "deviceScaleFactor": 1, "mobile": True}
 TELEPHONE = {"width": 390, "height": 844, "deviceScaleFactor": 2, "mobile": True}
 SCREENS = {"desktop": DESKTOP, "tablet": TABLET, "phone": TELEPHONE}
+STATES = ("disarmed", "armed", "playing", "vented", "fault", "driver_dead", "page_dead")
+NO_DITHER = Image.Dither.NONE
 SETTLING = 1.5
 """[s] for a window to lay itself out in another size."""
 CENTRE = """
@@ -30,6 +35,7 @@ const top = page.drawing.region[0].reduce((best, point) => (point[1] < best[1] ?
 return [box.left + top[0] * box.width / width, box.top + top[1] * box.height / height];
 """
 """Where the reachable region is highest, in the window."""
+LIVE = "return !document.body.matches('.lost') && !document.querySelector('#view.old-title')"
 RING = 17
 """[px] Radius of the drawn ring in the window."""
 POINTS = 24
@@ -50,13 +56,18 @@ class Photographer:
         self.resize(DESKTOP)
 
     def resize(self, screen: dict[str, Any]) -> None:
-        """Give the window the size of a screen."""
+        """Give the window the size of a screen, and a finger where it is mobile."""
+        touched = {"enabled": screen["mobile"]}
         self.window.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)
+        self.window.execute_cdp_cmd("Emulation.setTouchEmulationEnabled", touched)
         self.graph.client.spin(SETTLING)
 
-    def take(self, name: str) -> None:
-        """Write what the window shows."""
-        self.window.save_screenshot(str(self._folder / name))
+    def take(self, name: str, live: bool = True) -> None:
+        """Write what the window shows; ``live``: once its data are not old."""
+        if live:
+            self.wait(LIVE, "live data")
+        picture = Image.open(BytesIO(self.window.get_screenshot_as_png()))
+        save(picture, self._folder / name)
         print(self._folder / name, flush=True)
 
     def wait(self, script: str, what: str) -> Any:
@@ -68,6 +79,34 @@ class Photographer:
         button = f"document.getElementById('{name}')"
         self.wait(f"return !!{button} && !{button}.disabled", f"the button {name}")
         self.window.execute_script(f"{button}.click()")
+
+
+def save(picture: Image.Image, file: Path) -> None:
+    """Write a picture with few colours: the camera's noise makes it large otherwise."""
+    few = picture.convert("RGB").quantize(256, Image.Quantize.FASTOCTREE, dither=NO_DITHER)
+    few.save(file, optimize=True)
+
+
+def draw_sheet(folder: Path) -> None:
+    """Put the pictures of all states into one: desktop above, tablet and telephone below."""
+    cell, upper, lower, gap, per_row = 360, 225, 300, 8, 4
+    across, down = cell + 2 * gap, 24 + upper + lower + 3 * gap
+    rows = -(-len(STATES) // per_row)
+    sheet = Image.new("RGB", (per_row * across, rows * down), "white")
+    draw = ImageDraw.Draw(sheet)
+    for index, state in enumerate(STATES):
+        left, top = gap + index % per_row * across, index // per_row * down
+        draw.text((left, top), state.replace("_", " "), "black", font_size=16)
+        for name, x, y in (
+            ("desktop", 0, 0),
+            ("tablet", 0, upper + gap),
+            ("phone", 216, upper + gap),
+        ):
+            picture = Image.open(folder / f"page_{state}_{name}.png").convert("RGB")
+            picture.thumbnail((cell, upper if name == "desktop" else lower))
+            sheet.paste(picture, (left + x, top + 24 + y))
+    save(sheet, folder / "page_states.png")
+    print(folder / "page_states.png", flush=True)
 
 
 def draw_ring(photographer: Photographer) -> None:
@@ -97,7 +136,7 @@ def draw_states(photographer: Photographer) -> None:
     def take(state: str) -> None:
         for name, screen in SCREENS.items():
             photographer.resize(screen)
-            photographer.take(f"page_{state}_{name}.png")
+            photographer.take(f"page_{state}_{name}.png", live=state != "page_dead")
         photographer.resize(DESKTOP)
 
     def says(words: str) -> None:
@@ -139,6 +178,7 @@ def main() -> int:
         photographer = Photographer(graph, given.folder)
         if given.states:
             draw_states(photographer)
+            draw_sheet(given.folder)
             return 0
         press = photographer.press
         press("take")

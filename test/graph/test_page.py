@@ -30,6 +30,11 @@ if (!button || button.disabled) return false;
 button.click();
 return true;
 """
+FOR_EVER = """
+const set = window.setTimeout;
+window.setTimeout = (action, time) => (time < 30000 ? set(action, time) : 0);
+"""
+"""No message goes by itself."""
 
 
 class WatchedPage(Bench):
@@ -167,8 +172,13 @@ def test_what_died_is_not_shown_as_live(rig: WatchedPage) -> None:
     wait(old, "the driver's silence")
     assert "ago" in browser.find_element("id", "meaning").text
     assert browser.find_element("id", "mode").text == "NOT KNOWN"
+    browser.execute_script(FOR_EVER)
+    browser.find_element("id", "vent").click()
+    wait(notice("VENT NOT CONFIRMED"), "what to do meanwhile")
+    wait(notice("VENT FAILED"), "the failure to show")
     rig.driver.signal(signal.SIGCONT)
     wait(f"!{old}", "the driver's state again")
+    wait("document.getElementById('vent-notice').hidden", "a failure that is none any more to go")
     rig.driver.signal(signal.SIGKILL)
     wait(old, "the driver's death")
     wait(notice("The driver is dead: its process has ended"), "the alarm to say why")

@@ -179,12 +179,28 @@ def test_the_action_tells_how_it_goes_and_how_it_ended(planner):
     assert len(node.received("cut")) < len(node.wait_plan("cut").time)
 
 
+def goal_result(client, action):
+    """Send a goal, and return what comes of it."""
+    from der_msgs.action import PlayMotion
+    from der_msgs.msg import MotionCommand
+
+    command = MotionCommand(motion="asynchronous", amplitude=0.3, period=60.0, cycles=1)
+    sent = action.send_goal_async(PlayMotion.Goal(command=command))
+    client.wait_for(sent.done, 30.0, "the goal to be accepted")
+    answer = sent.result().get_result_async()
+    client.wait_for(answer.done, 30.0, "the result")
+    return answer.result().result
+
+
 def test_a_plan_belongs_to_the_arming_in_which_it_was_asked_for(planner):
-    """Asked for while disarmed, by topic or action, it is refused at once and never plays."""
+    """Asked for while disarmed, by topic or action, it is refused at once and never plays.
+
+    So it is while the driver is silent.
+    """
     from rclpy.action import ActionClient
 
     from der_msgs.action import PlayMotion
-    from der_msgs.msg import MotionCommand, PressureState
+    from der_msgs.msg import PressureState
     from limb_interfaces import qos, topics
 
     node = planner()
@@ -200,20 +216,16 @@ def test_a_plan_belongs_to_the_arming_in_which_it_was_asked_for(planner):
     def hears(name):
         client.wait_for(lambda: node.state()["driver"] == name, 30.0, f"the planner to hear {name}")
 
-    client.node.create_timer(0.05, tick)
+    ticking = client.node.create_timer(0.05, tick)
     hears("DISARMED")
     node.command(plan_id="early", period=60.0)
     refused = "early: the driver is DISARMED"
     client.wait_for(lambda: refused in node.state()["last_refusal"], 30.0, "the refusal")
     action = ActionClient(client.node, PlayMotion, "planner/play_motion")
     client.wait_for(action.server_is_ready, 30.0, "the action")
-    command = MotionCommand(motion="asynchronous", amplitude=0.3, period=60.0, cycles=1)
-    sent = action.send_goal_async(PlayMotion.Goal(command=command))
-    client.wait_for(sent.done, 30.0, "the goal to be accepted")
-    answer = sent.result().get_result_async()
-    client.wait_for(answer.done, 30.0, "the result")
-    assert answer.result().result.outcome == "refused"
-    assert "DISARMED" in answer.result().result.reason
+    result = goal_result(client, action)
+    assert result.outcome == "refused"
+    assert "DISARMED" in result.reason
 
     mode = PressureState.ARMED
     hears("ARMED")
@@ -228,3 +240,16 @@ def test_a_plan_belongs_to_the_arming_in_which_it_was_asked_for(planner):
     node.wait_state("done")
     assert {message.plan_id for _, message in node.setpoints} == {"later"}
     assert {plan.plan_id for plan in node.plans} == {"later"}
+
+    node.command(plan_id="last", period=2.0)
+    node.wait_state("streaming")
+    ticking.cancel()
+    node.wait_state("lost")
+    node.command(plan_id="silent", period=600.0)
+    refused = "silent: the driver has said nothing for"
+    client.wait_for(lambda: refused in node.state()["last_refusal"], 30.0, "the refusal")
+    result = goal_result(client, action)
+    assert result.outcome == "refused"
+    log = node.process.log.read_text()
+    assert "plan silent accepted" not in log
+    assert f"plan {result.plan_id} accepted" not in log

@@ -21,7 +21,7 @@ from der_planner.page.drawing import (
     reachable_region,
 )
 from der_planner.page.drawing_panel import summary
-from der_planner.planning import PathLimits, Workspace
+from der_planner.planning import PathLimits, Workspace, planner
 
 LIMB = Limb.default()
 ARCS = ArcModel(LIMB)
@@ -75,7 +75,7 @@ def test_what_is_no_drawing_is_refused(sent: object) -> None:
         drawn_pixels(sent)
 
 
-def test_a_preview_says_what_would_be_played_or_why_not() -> None:
+def test_a_preview_says_what_would_be_played_or_why_not(monkeypatch: pytest.MonkeyPatch) -> None:
     turn = np.linspace(0, 2 * np.pi, 40)
     ring = ARCS.tip([0.9, 0.9]) + 0.03 * np.column_stack([np.cos(turn), np.sin(turn)])
     found = preview(LIMB, ring, PathLimits(), "pcc", "paper")
@@ -89,6 +89,10 @@ def test_a_preview_says_what_would_be_played_or_why_not() -> None:
     slow = preview(LIMB, ring, PathLimits(speed=1e-6), "pcc", "paper")
     assert "the longest is 3600 s" in summary(slow)
     hanging = LIMB.mounted("hanging").carrying(0.1)
+    heavy = preview(hanging, ring, PathLimits(), "der", "projected")
+    assert not heavy.problem, "the rod takes more than the arcs by which the path was sought"
+    assert 0.95 < heavy.largest_pressure / LIMB.pneumatics.pressure_limit <= 1.0
+    monkeypatch.setattr(planner, "_SEARCHES", 1)
     heavy = preview(hanging, ring, PathLimits(), "der", "projected")
     assert "kPa are allowed" in heavy.problem
     assert np.linalg.norm(ring - heavy.place, axis=1).min() < 0.1  # on the way there

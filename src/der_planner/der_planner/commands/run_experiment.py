@@ -89,8 +89,8 @@ def _main() -> int:
     check_folder(options.out)
     with experiment_page(options, progress) as page:
         run(options, progress)
-        progress.say("done; the page stays with the report until Ctrl-C")
         with contextlib.suppress(KeyboardInterrupt):
+            progress.say("done; the page stays with the report until Ctrl-C")
             while page.alive:
                 time.sleep(0.5)
     return 0

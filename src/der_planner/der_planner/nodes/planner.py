@@ -167,6 +167,11 @@ class PlannerNode(Node):
     # Planning ------------------------------------------------------------------------------
 
     def _accept(self, request: Request) -> None:
+        # A driver that has died says nothing more on which the request could be dropped.
+        obstacle = self._driver.obstacle() if self._options.auto_start else None
+        if obstacle is not None and obstacle.outcome == "lost":
+            self._refuse(request.plan_id, obstacle.reason)
+            return
         with self._streamer.lock:
             replaced, self._request = self._request, request
         self._last_refusal = ""

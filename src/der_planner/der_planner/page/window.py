@@ -124,10 +124,12 @@ class OperatorWindow:
         """Return why a button can do nothing now; empty if it can."""
         if not self._parts.desk.may_command(self._client.id):
             return "take control first"
+        mode = self._parts.situation.driver_mode
+        concerned = name == "play" or (name == "arm" and mode == SILENT)
+        if concerned and mode in OBSTACLES:
+            return OBSTACLES[mode]
         if name != "play":
             return ""
-        if obstacle := OBSTACLES.get(self._parts.situation.driver_mode):
-            return obstacle
         if self._source.value == DRAWING and not self._drawing.ready:
             return "draw on the picture first, and wait for the preview"
         if self._source.value == LEARNED_PLAN and not self._form.learned:
@@ -223,14 +225,14 @@ def add_curves(segments: int) -> None:
             {
                 "animation": False,
                 "title": {
-                    "text": f"{title} [{unit}]", "left": 0, "top": 0, "padding": 0,
+                    "text": f"{title} [{unit}]", "left": 0, "top": 6, "padding": 0,
                     "textStyle": {"fontSize": 12},
                 },
                 "legend": {
-                    "top": 18, "left": 0, "padding": 0, "itemHeight": 8, "itemWidth": 18,
+                    "top": 24, "left": 0, "padding": 0, "itemHeight": 8, "itemWidth": 18,
                     "itemGap": 6, "textStyle": {"fontSize": 10},
                 },
-                "grid": {"left": 36, "right": 14, "top": 22 + 14 * rows, "bottom": 20},
+                "grid": {"left": 36, "right": 14, "top": 28 + 14 * rows, "bottom": 20},
                 "xAxis": {"type": "value", "min": -30, "max": 0, "name": "s", "nameGap": 4},
                 # Noise of a limb at rest is not drawn as if it were motion.
                 "yAxis": {"type": "value", "splitNumber": 3, "minInterval": 1 if kinds else 0.1},

@@ -378,7 +378,8 @@ def _find_poses(model: RodModel, time: Array, tip: Array, guess: Array) -> Poses
         raise BucklingError(
             f"no pose of the limb leads on to its tip at ({tip[error.step, 0]:.4f}, "
             f"{tip[error.step, 1]:.4f}) m at t = {time[error.step]:.2f} s: it would buckle or snap "
-            "through under its load. Shrink or move the motion, or mount the limb otherwise"
+            "through under its load. Shrink or move the motion, or mount the limb otherwise",
+            tip[error.step],
         ) from error
     check_stays(poses.smallest_stiffness, time, tip, "limb")
     missed = poses.misses > _POSE_TOLERANCE * model.limb.length

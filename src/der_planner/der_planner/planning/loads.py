@@ -32,7 +32,16 @@ class PlanningError(ValueError):
 
 
 class BucklingError(PlanningError):
-    """The limb buckles, snaps through or has more than one rest under its loads."""
+    """The limb buckles, snaps through or has more than one rest under its loads.
+
+    Args:
+        said: for people.
+        point: (x, y) of the tip where it does so on its way [m]; None: it does so at rest.
+    """
+
+    def __init__(self, said: str, point: Array | None = None) -> None:
+        super().__init__(said)
+        self.point = None if point is None else (float(point[0]), float(point[1]))
 
 
 @dataclass(eq=False)
@@ -213,5 +222,6 @@ def check_stays(stiffness: Array, time: Array, tip: Array, what: str) -> None:
         raise BucklingError(
             f"the {what} would snap through under the load at t = {time[k]:.2f} s, tip at "
             f"({tip[k, 0]:.4f}, {tip[k, 1]:.4f}) m. Shrink or move the motion, or mount the limb "
-            "otherwise"
+            "otherwise",
+            tip[k],
         )

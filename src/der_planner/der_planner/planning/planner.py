@@ -15,13 +15,18 @@ from der_planner.model import CONTROL_PERIOD, NODES, Model, RodModel, simulate
 from der_planner.model.commands import SlowVenting, slow_venting, within_limits
 from der_planner.model.commands import commands as commands_for
 from der_planner.planning.configuration import METHODS, Configuration, configure
-from der_planner.planning.loads import PlanningError, nearly_buckling
+from der_planner.planning.loads import (
+    BucklingError,
+    OverloadError,
+    PlanningError,
+    nearly_buckling,
+)
 from der_planner.planning.motions import Motion, Reference
 from der_planner.planning.obstacles import Obstacles
 from der_planner.planning.optimal import Optimiser, Optimum
 from der_planner.planning.plan_file import Plan
 from der_planner.planning.timing import Start
-from der_planner.planning.workspace import Workspace
+from der_planner.planning.workspace import UnreachableError, Workspace
 from der_planner.rod import ConvergenceError
 
 _THREADS = ThreadpoolController()
@@ -29,6 +34,12 @@ _FINE = 2
 """Points of the balance's grid a control period."""
 _ROUNDS = 6
 """A reference is led past what is in the way so often at most."""
+_SEARCHES = 4
+"""A nearest path is sought so often, each time with less pressure."""
+_HELD = 0.94
+"""Share of the pressure that may be held, where a refusal does not tell it."""
+_SHRINK = 0.98
+"""Share of what may be held that the next search has."""
 _NOTABLE_CUT = 20.0
 """Cuts by limits are worth a warning from here on [Pa]."""
 _NOTABLE_OPPOSITE = 1000.0
@@ -80,8 +91,8 @@ def plan(
     with _THREADS.limit(limits=1, user_api="blas"):
         rod = RodModel(limb, nodes)
         body = rod if model == "der" else Model.of(limb, model)
-        reference = motion.reference(Workspace(rod), start)
-        configuration, led = configure(body, reference), ""
+        reference, configuration = _followed(motion, rod, body, start)
+        led = ""
         if obstacles is not None:
             rounds = _ROUNDS if model == "der" and method == "optimal" else 0
             configuration, led, reference = _past(obstacles, rod, configuration, reference, rounds)
@@ -124,6 +135,29 @@ def plan(
         warnings=tuple(filter(None, said)),
         details=found.details if method == "optimal" else {},
     )
+
+
+def _followed(
+    motion: Motion, rod: RodModel, body: Model, start: Start | None
+) -> tuple[Reference, Configuration]:
+    """Return a motion's reference, and the configuration of a model along it.
+
+    Arcs tell only to about a tenth what a loaded rod takes to be held: a nearest path that the
+    model refuses is sought again where arcs take less pressure.
+    """
+    share = 1.0
+    for left in reversed(range(_SEARCHES if motion.nearest else 1)):
+        try:
+            reference = motion.reference(Workspace(rod, share), start)
+            return reference, configure(body, reference)
+        except (BucklingError, OverloadError, UnreachableError) as error:
+            if not left or error.point is None:  # at rest already
+                raise
+            held = _HELD
+            if isinstance(error, OverloadError):
+                held = error.pressure_limit / error.required_pressure
+            share *= _SHRINK * held
+    raise AssertionError("one of the searches returns or raises")
 
 
 def _solve(

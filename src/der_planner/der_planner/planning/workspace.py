@@ -107,6 +107,7 @@ class Workspace:
 
     Args:
         model: of the limb.
+        share: of its pressure limit that may be used.
 
     Attributes:
         limb: of the model.
@@ -119,12 +120,12 @@ class Workspace:
             Under gravity they are bounds: as if the whole weight beyond a segment pulled across it.
     """
 
-    def __init__(self, model: Model) -> None:
+    def __init__(self, model: Model, share: float = 1.0) -> None:
         limb = model.limb
         self._model, self.limb, self.is_loaded = model, limb, model.is_loaded
         self.arcs = model if isinstance(model, ArcModel) else ArcModel(limb)
         self.sags = limb.gravity[2] != 0
-        self.pressure_limit = limb.pneumatics.pressure_limit
+        self.pressure_limit = share * limb.pneumatics.pressure_limit
         self.fastest = limb.pneumatics.slew_limit * limb.static_gain
         self.low, self.high = self._angle_limits()
 
@@ -178,7 +179,8 @@ class Workspace:
         except ConvergenceError as error:
             raise BucklingError(
                 f"the limb cannot be held at t = {instants[error.step]:.2f} s: under its load it "
-                "would snap through. Shrink the motion, or mount the limb otherwise"
+                "would snap through. Shrink the motion, or mount the limb otherwise",
+                self.arcs.tip(wanted[error.step]),
             ) from error
         tips = np.array([state.q[-3:-1] for state in poses.states])
         return make_interp_spline(instants, tips, k=5)(time)

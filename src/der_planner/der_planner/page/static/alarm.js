@@ -9,7 +9,9 @@
   page.onState.push((silence, lost, unheard) => {
     const driver = page.ageOf("driver") === null ? null : page.data.driver;
     const old = lost || page.isOld("driver");
-    showAlarms(lost ? [ofServer(silence, unheard, driver)] : page.data?.alarms ?? [], silence);
+    const known = page.data?.alarms ?? [], slow = lost && page.data && unheard <= SLOW;
+    if (slow) showAlarms([...known, ofServer(silence, unheard, driver)], silence); // what is dead stays so
+    else showAlarms(lost ? [ofServer(silence, unheard, driver)] : known, silence);
     showState(driver, old);
   });
 
@@ -35,7 +37,7 @@
     alarms.forEach((alarm, index) => {
       const line = place.children[index] ?? place.appendChild(document.createElement("div"));
       const since = alarm.since == null ? "" : ` (for ${ago(alarm.since + Math.max(silence, 0))})`;
-      const advice = alarm.advice ? ` → ${alarm.advice[0].toUpperCase()}${alarm.advice.slice(1)}.` : "";
+      const advice = alarm.advice ? ` → ${alarm.advice[0].toUpperCase()}${alarm.advice.slice(1)}` : ""; // no full stop: it may end with a command
       const full = alarm.text.endsWith("…") || alarm.text.endsWith(".") ? "" : ".";
       put(line, `${alarm.text}${since}${full}${advice}`); // as text, never as HTML
       if (line.className !== alarm.level) line.className = alarm.level;
@@ -54,6 +56,9 @@
     if (driver && !known) meaning = `${ago(page.ageOf("driver"))} ago: ${driver.mode}, ${page.data.limb_is}`;
     put(find("meaning"), meaning);
     put(find("figures"), known ? figures(driver) : "");
+    const failed = find("vent-notice"); // of a vent that the limb has taken after all
+    const vented = known && driver.mode === "disarmed" && page.data.limb_is === "without pressure";
+    if (vented && failed.className === "danger") failed.hidden = true;
   }
 
   // Present numbers: pressures, tip error, progress of the plan.

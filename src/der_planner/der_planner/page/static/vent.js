@@ -3,16 +3,17 @@
 "use strict";
 (() => {
   const PRESS = 1000; // ms after a press during which the click that ends it is no second press
-  const CONFIRMED = 900; // ms after which a vent that nobody has confirmed is said to be none
+  const CONFIRMED = 700; // ms after the press from which a vent that nobody has confirmed is said to be none
   const find = (id) => document.getElementById(id);
   const button = find("vent"), notice = find("vent-notice");
   let pressed = -Infinity, hiding = 0;
 
-  async function vent() {
+  async function vent(press) {
     let good = false, text;
     button.classList.add("sent");
     // Whoever waits for an answer must not wait longer than the limb may.
-    const late = setTimeout(() => tell("VENT NOT CONFIRMED yet: close the valve at the air supply now.", false), CONFIRMED);
+    const late = setTimeout(() => tell("VENT NOT CONFIRMED yet: close the valve at the air supply now.", false),
+      press.timeStamp + CONFIRMED - performance.now());
     try {
       const answer = await fetch("/vent", { method: "POST", signal: AbortSignal.timeout(4000) });
       const result = answer.ok ? await answer.json() : { message: await answer.text() };
@@ -38,12 +39,12 @@
   button.addEventListener("pointerdown", (event) => {
     event.preventDefault();
     pressed = performance.now();
-    vent();
+    vent(event);
   });
   // The Enter key, screen readers and switches click without a pointer.
   button.addEventListener("click", (event) => {
     event.preventDefault();
-    if (event.detail === 0 || performance.now() - pressed > PRESS) vent();
+    if (event.detail === 0 || performance.now() - pressed > PRESS) vent(event);
   });
 
   // Whether a space belongs to a text that is being written; no number has one.
@@ -59,7 +60,7 @@
       if (event.code !== "Space" || typing(event.target)) return;
       event.preventDefault();
       event.stopImmediatePropagation();
-      if (kind === "keydown" && !event.repeat) vent();
+      if (kind === "keydown" && !event.repeat) vent(event);
     }, true);
   }
   const sayKey = () => {
