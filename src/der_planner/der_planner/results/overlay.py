@@ -386,7 +386,7 @@ def _write_animation(run: RunSeries, path: Path, frames: Frames) -> int | None:
             kept.append(cv2.resize(frame, (ANIMATION_WIDTH, height), interpolation=cv2.INTER_AREA))
             due = time + ANIMATION_STEP - 0.01
     animation.frames = kept
-    animation.durations = np.full(len(kept), round(1000 * ANIMATION_STEP))
+    animation.durations = [round(1000 * ANIMATION_STEP)] * len(kept)
     quality = [cv2.IMWRITE_WEBP_QUALITY, ANIMATION_QUALITY]
     if kept and not cv2.imwriteanimation(str(path), animation, quality):
         return None
