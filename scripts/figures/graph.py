@@ -60,6 +60,7 @@ def main() -> int:
             lambda each: each.execute_script("return window.drawn")
         )
     shorter = re.sub(r"(\.\d)\d+", r"\1", drawn)
+    shorter = shorter.replace('style="', 'style="background: white; ', 1)  # for dark pages
     DRAWING.write_text(f"{shorter}\n{mark()}\n")
     print(DRAWING)
     return 0
