@@ -4,9 +4,10 @@ Bring your own limb: any simulator, in forty lines
 
 Planner, learning and feedback need very little of a limb: pressures go in, and the tip and the bend angles
 of its segments come out. This tutorial puts another simulator behind them: a chain of links in MuJoCo, where
-``.venv/bin/python -m pip install mujoco`` has brought it (the project does not need it), else the same chain
-written in numpy. MuJoCo 4.0.0 gave, by ``python3 scripts/workspace.py exec python
-docs/tutorials/4_bring_your_own_limb.py``, mean errors of 2.99, 0.60 and 0.04 mm, and 0.61 mm with feedback.
+it is installed (``pip install mujoco``; the project does not need it), else the same chain written in numpy.
+MuJoCo 4.0.0 gave mean errors of 2.99, 0.60 and 0.04 mm, and 0.61 mm with feedback, by ``python3
+scripts/workspace.py exec PYTHON docs/tutorials/4_bring_your_own_limb.py``, with the PYTHON of an environment
+that adds MuJoCo to ``.venv``.
 """
 
 import matplotlib.pyplot as plt
