@@ -1,14 +1,14 @@
 #!/usr/bin/env python3
 """Draw the pictures of the documentation pages.
 
-python3 scripts/draw_figures.py {loads,page,planning,rod,tracker} [arguments]
+python3 scripts/draw_figures.py {graph,loads,page,planning,rod,tracker} [arguments]
 """
 
 import sys
 
 import workspace
 
-PAGES = ("loads", "page", "planning", "rod", "tracker")
+PAGES = ("graph", "loads", "page", "planning", "rod", "tracker")
 
 if __name__ == "__main__":
     if sys.argv[1:] in (["-h"], ["--help"]):

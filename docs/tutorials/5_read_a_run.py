@@ -88,10 +88,6 @@ plt.ylabel("y [m]")
 plt.show()
 
 # %%
-# As a table for pandas, in one line::
-#
-#     pandas.DataFrame(run.tip.value, index=run.tip.time, columns=["x", "y"])
-#
 # From the command line: ``python3 scripts/evaluate.py BAG --report DIR``.
 
 assert result.mean_error_m < 0.01

@@ -69,9 +69,10 @@ class PageGraph:
     Args:
         folder: of logs and profiles.
         stack: ends nodes and browsers.
+        options: of the `GraphSetup`, such as the twin's seed.
     """
 
-    def __init__(self, folder: Path, stack: contextlib.ExitStack) -> None:
+    def __init__(self, folder: Path, stack: contextlib.ExitStack, **options: Any) -> None:
         self._folder, self._stack = folder, stack
         self._processes: dict[str, NodeProcess] = {}
         self._windows = 0
@@ -86,7 +87,8 @@ class PageGraph:
             page_port = free.getsockname()[1]
         self.url = f"http://127.0.0.1:{page_port}/?token={PAGE_TOKEN}"
         board = str(folder / "board")
-        setup = GraphSetup(bag=folder / "bag", metadata={}, planner={}, page=page_port)
+        options = {"metadata": {}, "planner": {}, **options}
+        setup = GraphSetup(bag=folder / "bag", page=page_port, **options)
         for spec in setup.nodes(board):
             parameters = spec.parameters
             if spec.executable == "page":  # a window whose picture is taken is silent meanwhile
@@ -154,11 +156,11 @@ class PageGraph:
 
 
 @contextlib.contextmanager
-def page_graph() -> Iterator[PageGraph]:
-    """Run the whole graph with the page in a folder of its own."""
+def page_graph(**options: Any) -> Iterator[PageGraph]:
+    """Run the whole graph with the page in a folder of its own; options as of `PageGraph`."""
     os.environ.setdefault("ROS_DOMAIN_ID", DOMAIN)
     with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
-        yield PageGraph(Path(folder), stack)
+        yield PageGraph(Path(folder), stack, **options)
 
 
 def send_pressure(publisher: Any, plan_id: str) -> None:

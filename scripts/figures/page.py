@@ -1,4 +1,4 @@
-"""Draw the pictures of docs/guide/page.md: the page on a twin, in the machine's Chromium.
+"""Film a run on the twin, and take the page's pictures while it plays, in the machine's Chromium.
 
 python3 scripts/draw_figures.py page [FOLDER] [--states]
 """
@@ -17,6 +17,8 @@ from PIL import Image, ImageDraw
 from benchmarks.page import PageGraph, page_graph
 from der_msgs.msg import PressureState
 from der_planner.experiment.console import folder_argument
+from der_planner.results import evaluate_run, format_table, load_run, summarise
+from der_planner.results.overlay import write_video
 from workspace_setup.basics import ROOT
 
 DOC = ROOT / "docs" / "pictures"
@@ -36,9 +38,11 @@ return [box.left + top[0] * box.width / width, box.top + top[1] * box.height / h
 """
 """Where the reachable region is highest, in the window."""
 LIVE = "return !document.body.matches('.lost') && !document.querySelector('#view.old-title')"
-RING = 17
-"""[px] Radius of the drawn ring in the window."""
-POINTS = 24
+EIGHT = (100, 11, 330)
+"""[px] Half width and half height of the drawn eight, and radius of what it lies along."""
+POINTS = 48
+LIMB = ROOT / "docs" / "tutorials" / "seed_3.yaml"
+"""Identified on the twin of seed 3."""
 
 
 class Photographer:
@@ -109,8 +113,8 @@ def draw_sheet(folder: Path) -> None:
     print(folder / "page_states.png", flush=True)
 
 
-def draw_ring(photographer: Photographer) -> None:
-    """Draw a ring where the tip reaches farthest, and wait for its preview."""
+def draw_eight(photographer: Photographer) -> None:
+    """Draw a lying eight where the tip reaches farthest, and wait for its preview."""
     from selenium.webdriver import ActionChains  # noqa: PLC0415 - only this and the tests need it
 
     photographer.press("draw")
@@ -118,8 +122,11 @@ def draw_ring(photographer: Photographer) -> None:
     x, y = photographer.window.execute_script(CENTRE)
     actions = ActionChains(photographer.window, duration=20)
     pointer = actions.w3c_actions.pointer_action
+    half_width, half_height, radius = EIGHT
     angles = [2.0 * math.pi * index / POINTS for index in range(POINTS + 1)]
-    places = [(int(x + RING * math.cos(a)), int(y + 6 + RING * math.sin(a))) for a in angles]
+    eight = [(half_width * math.sin(a), half_height * math.sin(2.0 * a)) for a in angles]
+    drop = half_height + radius
+    places = [(int(x + u), int(y + v + drop - math.sqrt(radius**2 - u**2))) for u, v in eight]
     pointer.move_to_location(*places[0])
     pointer.pointer_down()
     for place in places[1:]:
@@ -174,7 +181,8 @@ def main() -> int:
     parser.add_argument("--states", action="store_true", help="every state on every screen instead")
     given = parser.parse_args()
     given.folder.mkdir(parents=True, exist_ok=True)
-    with page_graph() as graph:
+    planner = {"limb_file": str(LIMB)}
+    with page_graph(seed=3, planner=planner, record_images=not given.states) as graph:
         photographer = Photographer(graph, given.folder)
         if given.states:
             draw_states(photographer)
@@ -183,7 +191,8 @@ def main() -> int:
         press = photographer.press
         press("take")
         press("arm")
-        draw_ring(photographer)
+        draw_eight(photographer)
+        bag = graph.client.call("recorder/start")
         press("play")
         graph.wait_mode(PressureState.TRACKING)
         graph.client.spin(6.0)
@@ -194,4 +203,9 @@ def main() -> int:
         photographer.window.get(urljoin(graph.url, "/setup"))
         graph.client.spin(SETTLING)
         photographer.take("page_setup.png")
+        graph.wait_mode(PressureState.ARMED)
+        graph.client.call("recorder/stop")
+        run = load_run(Path(bag))
+        print(format_table(summarise([evaluate_run(run)])))
+        print(write_video(run, given.folder / "run.webp"))
     return 0

@@ -51,7 +51,7 @@ def build_jobs() -> list[Job]:
         *ros_setup_lines(),
         f'"{python}" -m colcon --log-base log build --base-paths src '
         f"--symlink-install --packages-select {' '.join(PACKAGES)} "
-        f"--cmake-args -DCMAKE_BUILD_TYPE=Release -DBUILD_TESTING=OFF "
+        f"--cmake-args -DCMAKE_BUILD_TYPE=Release -DBUILD_TESTING=ON "
         f'-DPython3_EXECUTABLE="{python}" -DPYTHON_EXECUTABLE="{python}"',
     ]
     what = f"building {', '.join(PACKAGES)} with colcon"

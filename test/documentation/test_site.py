@@ -7,6 +7,7 @@ import re
 import pytest
 
 from documentation import build, reference
+from figures import graph
 from limb_interfaces import topics
 from workspace_setup.basics import ROOT
 
@@ -21,6 +22,17 @@ def test_the_site_is_built_without_a_warning_and_its_tutorials_run():
 def test_each_topic_has_a_text():
     names = {value for name, value in vars(topics).items() if name.isupper()}
     assert dict(reference.topic_texts()).keys() == names - {topics.NAMESPACE, topics.BASE_FRAME}
+
+
+def test_the_drawing_of_the_graph_has_topics_at_their_ends():
+    nodes = json.loads(reference.GRAPH.read_text())
+    arrows = re.findall(r'(\w+) -- "(.+)" --> (\w+)', graph.text())
+    assert len(arrows) >= 8
+    for source, label, target in arrows:
+        named = set(label.split(", "))
+        assert source == "you" or named <= nodes[source]["publishes"].keys()
+        assert named <= nodes[target]["subscribes"].keys()
+    assert graph.mark() in graph.DRAWING.read_text(), "python3 scripts/draw_figures.py graph"
 
 
 @pytest.mark.parametrize("name", ["foxglove_layout.json", "limb.rviz"])

@@ -68,7 +68,7 @@ class Bench:
         return self.recorder._health()
 
     def written(self) -> int:
-        return int(self.health().values.get("messages", 0))
+        return int(self.health().values.get("recorded", 0))
 
 
 @pytest.fixture

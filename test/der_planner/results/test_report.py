@@ -90,6 +90,14 @@ def test_film_has_every_frame(bag: Path, tmp_path: Path):
     assert count == len(FRAMES[FRAMES >= 0][::10])
 
 
+def test_an_animated_picture_shows_the_motion_alone(bag: Path, tmp_path: Path):
+    path = write_video(load_run(bag), tmp_path / "film.webp")
+    _, film = cv2.imreadanimation(str(path))
+    shown = FRAMES[FRAMES >= 0][::10]
+    assert len(film.frames) == np.count_nonzero(shown <= TIMES[-1])
+    assert film.frames[0].shape[:2] == (420, 560)
+
+
 def test_bag_without_images_has_shapes_but_no_film(tmp_path: Path):
     loaded = load_run(BagOfRun(tmp_path / "plain").still_run())
     assert len(plot_shapes([loaded], tmp_path)) == 2

@@ -46,7 +46,12 @@ def _arguments() -> argparse.Namespace:
         help="write report.html, results.json, table.{md,csv,tex} and the figures (PDF, PNG)",
     )
     parser.add_argument("--results", type=Path, metavar="DIR", help="write results.json only")
-    parser.add_argument("--video", type=Path, metavar="FILE", help="overlay film of the first bag")
+    parser.add_argument(
+        "--video",
+        type=Path,
+        metavar="FILE",
+        help="film of the first bag: .mp4, or .webp for a page",
+    )
     parser.add_argument(
         "--window",
         choices=WINDOWS,

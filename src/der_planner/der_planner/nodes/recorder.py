@@ -347,7 +347,7 @@ class Recorder(Node):
         values |= {
             "state": "paused" if session.paused else "recording",
             "bag": bag.folder,
-            "messages": bag.message_count,
+            "recorded": bag.message_count,
             "bytes": bag.byte_count,
             "files": bag.file_count,
             "dropped": session.dropped,

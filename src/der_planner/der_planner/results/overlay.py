@@ -57,7 +57,16 @@ FITTED = 60.0
 NEAR = 0.5
 """Messages within this time of an instant may belong to it [s]."""
 
+ANIMATION_WIDTH = 560
+"""Of an animated picture [px]."""
+ANIMATION_STEP = 0.15
+"""From one of its frames to the next [s]."""
+ANIMATION_QUALITY = 45
+"""Of 100."""
+
 Picture = NDArray[np.uint8]
+Frames = Iterator[tuple[float, Picture]]
+"""Times [s] and pictures of a film."""
 _NOTHING = np.empty((0, 2))
 
 
@@ -164,8 +173,8 @@ class RunImages:
             found = [marker for marker in markers if marker.ns == LIMB_MARKER]
         return min(found, key=lambda each: abs(header_stamp(each) - when), default=None)
 
-    def pictures(self) -> Iterator[tuple[float, Picture, Array]]:
-        """Yield each picture: its time [s] since the first setpoint, gray values, measured curve.
+    def pictures(self) -> Iterator[tuple[float, Snapshot]]:
+        """Yield the limb at each picture, with the time [s] since the first setpoint.
 
         Pictures of an encoding that is not known are left out.
         """
@@ -174,11 +183,19 @@ class RunImages:
             for _, _, message in self._bag.messages(self._topics[STATE_TYPE])
             if message.valid
         }
+        limbs = {
+            header_stamp(marker): _points(marker.points)
+            for _, _, message in self._bag.messages(self._topics[MARKERS_TYPE])
+            for marker in message.markers
+            if marker.ns == LIMB_MARKER
+        }
         for _, _, message in self._bag.messages(self._topics[IMAGE_TYPE]):
             picture, stamp = gray(message), header_stamp(message)
             if picture is not None:
+                near = min(limbs, key=lambda each: abs(each - stamp), default=0)
+                planned = limbs[near] if abs(near - stamp) < NEAR * NANOSECONDS else _NOTHING
                 time = (stamp - self._origin) / NANOSECONDS
-                yield time, picture, curves.get(stamp, _NOTHING)
+                yield time, Snapshot(picture, curves.get(stamp, _NOTHING), planned)
 
 
 def _topics_of(bag: BagReader, type_name: str, namespace: str) -> list[str]:
@@ -315,63 +332,86 @@ def _draw_shot(
 
 
 def write_video(run: RunSeries, path: Path) -> Path:
-    """Write an MP4 of the camera's frames with the measured curve, tip and reference tip drawn in.
+    """Write a film of the camera's frames with reference path, planned and measured limb drawn in.
 
     Args:
         run: of a bag with images.
-        path: of the film; its folder exists.
+        path: of the film, an MP4, or a small animated picture of the motion alone where it ends
+            in ``.webp``; its folder exists.
 
     Raises:
         EvaluationError: the bag has no images, calibration or tags, or the film cannot be written.
     """
     path_of_bag = run.description.bag
-    film: cv2.VideoWriter | None = None
     with BagReader(path_of_bag) as bag:
         images = RunImages(bag, run)
         project = images.projection()
         if project is None:
             raise EvaluationError(f"{path_of_bag}: no camera calibration or too few limb tags")
-        for time, picture, curve in images.pictures():
-            film = film or _open_film(path, run, picture)
-            film.write(_film_frame(picture, time, curve, run, project))
-    if film is None:
+        frames = ((time, _film_frame(shot, time, run, project)) for time, shot in images.pictures())
+        write = _write_animation if path.suffix == ".webp" else _write_film
+        try:
+            written = write(run, path, frames)
+        except cv2.error:
+            written = None
+    if written == 0:
         raise EvaluationError(
             f"{path_of_bag}: no images of a known encoding; record them with record_images:=true"
         )
-    film.release()
+    if written is None:
+        raise EvaluationError(f"cannot write the film {path}: is its folder writable?")
     return path
 
 
-def _open_film(path: Path, run: RunSeries, frame: Picture) -> cv2.VideoWriter:
-    rate = 1.0 / float(np.median(np.diff(run.tip.time)))
-    height, width = frame.shape
-    code = cv2.VideoWriter.fourcc(*"mp4v")
-    film = cv2.VideoWriter(str(path), code, rate, (width, height))
-    if not film.isOpened():
-        raise EvaluationError(f"cannot write the film {path}: is its folder writable?")
-    return film
+def _write_film(run: RunSeries, path: Path, frames: Frames) -> int | None:
+    """Write every frame; return how many, or None where the file cannot be written."""
+    rate, count = 1.0 / float(np.median(np.diff(run.tip.time))), 0
+    film = cv2.VideoWriter()
+    for _, frame in frames:
+        size = (frame.shape[1], frame.shape[0])
+        if not count and not film.open(str(path), cv2.VideoWriter.fourcc(*"mp4v"), rate, size):
+            return None
+        film.write(frame)
+        count += 1
+    film.release()
+    return count
 
 
-def _film_frame(
-    frame: Picture,
-    time: float,
-    curve: Array,
-    run: RunSeries,
-    project: Projection,
-) -> Picture:
-    picture = np.asarray(cv2.cvtColor(frame, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
+def _write_animation(run: RunSeries, path: Path, frames: Frames) -> int | None:
+    """Write some frames of the motion; return how many, or None where it cannot be written."""
+    animation, kept, due = cv2.Animation(), [], 0.0
+    for time, frame in frames:
+        if due <= time <= run.reference.time[-1]:
+            height = round(ANIMATION_WIDTH * frame.shape[0] / frame.shape[1])
+            kept.append(cv2.resize(frame, (ANIMATION_WIDTH, height), interpolation=cv2.INTER_AREA))
+            due = time + ANIMATION_STEP - 0.01
+    animation.frames = kept
+    animation.durations = [round(1000 * ANIMATION_STEP)] * len(kept)
+    quality = [cv2.IMWRITE_WEBP_QUALITY, ANIMATION_QUALITY]
+    if kept and not cv2.imwriteanimation(str(path), animation, quality):
+        return None
+    return len(kept)
+
+
+def _film_frame(shot: Snapshot, time: float, run: RunSeries, project: Projection) -> Picture:
+    picture = np.asarray(cv2.cvtColor(shot.picture, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
     red, green, blue = (int(colour(run.description.model)[i : i + 2], 16) for i in (1, 3, 5))
-    paint = (blue, green, red)
-    path = np.rint(project(run.reference.value)).astype(np.int32)
-    cv2.polylines(picture, [path], False, (255, 255, 255), 1, cv2.LINE_AA)
-    if len(curve):
-        line = np.rint(project(curve)).astype(np.int32)
-        cv2.polylines(picture, [line], False, paint, 3, cv2.LINE_AA)
-        cv2.circle(picture, line[-1].tolist(), 7, paint, -1, cv2.LINE_AA)
+    paint, white = (blue, green, red), (255, 255, 255)
+
+    def draw(points: Array, color: tuple[int, int, int], width: int) -> None:
+        line = np.rint(project(points)).astype(np.int32)
+        cv2.polylines(picture, [line], False, color, width, cv2.LINE_AA)
+
+    draw(run.reference.value, white, 1)
+    if len(shot.measured):
+        draw(shot.measured, paint, 9)
+        tip = np.rint(project(shot.measured[-1:]))[0].astype(int).tolist()
+        cv2.circle(picture, tip, 11, paint, -1, cv2.LINE_AA)
+    draw(shot.planned, white, 2)
     if 0.0 <= time <= run.reference.time[-1]:
         asked = [[np.interp(time, run.reference.time, column) for column in run.reference.value.T]]
         centre = np.rint(project(np.array(asked)))[0].astype(int).tolist()
-        cv2.circle(picture, centre, 9, (255, 255, 255), 2, cv2.LINE_AA)
+        cv2.circle(picture, centre, 13, white, 2, cv2.LINE_AA)
     text = f"{run.description.motion} {run.description.model}  {time:6.2f} s"
-    cv2.putText(picture, text, (16, 32), cv2.FONT_HERSHEY_SIMPLEX, 0.8, (255, 255, 255), 2)
+    cv2.putText(picture, text, (16, 32), cv2.FONT_HERSHEY_SIMPLEX, 0.8, white, 2)
     return picture

@@ -63,7 +63,7 @@
 
   function recording(message, values) {
     if (values.bytes === undefined) return message;
-    return `${message}, ${(Number(values.bytes) / 1e6).toFixed(1)} MB, ${values.messages} messages`;
+    return `${message}, ${(Number(values.bytes) / 1e6).toFixed(1)} MB, ${values.recorded} messages`;
   }
 
   function showSupply(driver) {
