@@ -13,7 +13,7 @@ from pressure_driver.protocols import NAMES, host_protocol
 
 PERIOD = 0.05
 """[s] between two commands, which stay valid for five of them."""
-COMMAND = (9_000.0, -5_000.0)
+COMMAND = (9_000.0, 0.0, 0.0, 5_000.0)
 """[Pa] when the host dies."""
 VENTED = 500.0
 """[Pa] gauge."""

@@ -16,7 +16,7 @@ from apriltag_tracker.synthetic.poses import MocapFaults, SyntheticMocap
 from apriltag_tracker.synthetic.shapes import constant_curvature
 from der_planner.commands.check_rig import found_frame, played_wiring
 from der_planner.identification.rig import RigError, RigFinding, ValveFinding
-from pressure_driver.hoses import HoseError
+from pressure_driver.settings import SettingError
 
 
 def found(*moves: tuple[int, int], contradictions: tuple[str, ...] = ()) -> RigFinding:
@@ -40,14 +40,16 @@ def found(*moves: tuple[int, int], contradictions: tuple[str, ...] = ()) -> RigF
     ],
 )
 def test_the_driver_gets_the_valve_of_each_chamber(moves, before, wiring):
-    assert played_wiring(found(*moves), before) == wiring
+    assert played_wiring(found(*moves), {"wiring": before}) == wiring
 
 
 def test_what_cannot_be_played_is_refused():
-    with pytest.raises(HoseError, match="swap the hoses"):
-        played_wiring(found((0, 1), (1, 1), (0, -1), (1, -1)), "")
+    crossed = found((0, 1), (1, 1), (0, -1), (1, -1))
+    assert played_wiring(crossed, {"protocol": "native"}) == "1,3,2,4"
+    with pytest.raises(SettingError, match="hoses of each segment on one pair"):
+        played_wiring(crossed, {})
     with pytest.raises(RigError, match="wrong port"):
-        played_wiring(found((0, 1), (0, 1), (1, 1), (1, -1), contradictions=("wrong port",)), "")
+        played_wiring(found((0, 1), (0, 1), (1, 1), (1, -1), contradictions=("wrong port",)), {})
 
 
 def test_the_frame_of_a_map_without_fixed_bodies_is_found():

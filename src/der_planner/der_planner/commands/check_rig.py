@@ -16,7 +16,9 @@ import argparse
 import sys
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
@@ -42,8 +44,8 @@ from der_planner.limb import Limb
 from der_planner.twin import TwinError
 from der_planner.twin.wiring import Wiring
 from limb_interfaces import topics
-from pressure_driver.hoses import HoseError, Hoses
-from pressure_driver.settings import Settings
+from pressure_driver.following import valves_of
+from pressure_driver.settings import SettingError, Settings
 
 TAGS_TYPE = "der_msgs/msg/TagDetectionArray"
 CLAMP_OFF = (0.002, 0.002, float(np.deg2rad(1.5)))
@@ -109,10 +111,9 @@ def _main(given: argparse.Namespace) -> int:
             frame = found_frame(clamp, told, height)
             lines.append("limb_base: found from the limb, for a map without fixed bodies")
     print("\n".join(lines))
-    before = hardware.driver.get("wiring", "") if hardware else ""
     try:
-        wiring = played_wiring(finding, str(before))
-    except (HoseError, RigError) as error:
+        wiring = played_wiring(finding, hardware.driver if hardware else {})
+    except (SettingError, RigError) as error:
         print(f"no file is written: {error}", file=sys.stderr)
         return 3
     if given.out is not None:
@@ -211,23 +212,21 @@ def _bodies(given: argparse.Namespace, hardware: Hardware | None) -> TagMap | Bo
     return TagMap.from_yaml(tracker.get("tag_map", share / "tags.yaml"))
 
 
-def played_wiring(finding: RigFinding, before: str) -> str:
+def played_wiring(finding: RigFinding, driver: Mapping[str, Any]) -> str:
     """Return the driver's parameter ``wiring`` for what was found.
 
     Args:
-        finding: of a check that was played with the driver's present wiring.
-        before: that wiring; empty: each chamber its own valve.
+        finding: of a check.
+        driver: parameters of the driver in it.
 
     Raises:
-        HoseError: the driver cannot play it; says which hoses to swap.
+        SettingError: the board cannot play it; says what to do.
         RigError: the rig contradicts itself.
     """
-    chambers = finding.wiring
-    valves = [int(word) for word in before.replace(",", " ").split()]
-    valves = valves or list(range(1, len(chambers) + 1))
-    found = ",".join(str(valves[channel]) for channel in chambers)
-    Hoses(found, len(chambers) // 2)
-    return found
+    present = Settings(**driver)
+    valves = valves_of(present.wiring, len(finding.valves))
+    found = ",".join(str(valves[channel] + 1) for channel in finding.wiring)
+    return replace(present, wiring=found).wiring
 
 
 def read_check(path: Path, bodies: TagMap | BodyMap) -> RigLog:
