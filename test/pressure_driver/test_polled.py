@@ -7,7 +7,7 @@ import pytest
 from waiting import Clock
 
 from pressure_driver.emulator.device import BoardReading
-from pressure_driver.emulator.polled import FestoBoard, PneudriveBoard
+from pressure_driver.emulator.polled import FestoBoard
 from pressure_driver.protocols import BoardFailure, Echo, Telemetry, host_protocol, modbus
 from pressure_driver.safety import Mode
 from pressure_driver.settings import Settings

@@ -76,16 +76,6 @@ class BaseFrame:
         """Return points (n, 3) of the poses' frame [m] in `limb_base`."""
         return np.asarray(points @ self.rotation.T + self.translation, dtype=np.float64)
 
-    def moved(self, origin: NDArray[np.float64], axes: NDArray[np.float64]) -> BaseFrame:
-        """Return the frame whose origin and axes, as columns, are these in this one."""
-        return BaseFrame(axes.T @ self.rotation, axes.T @ (self.translation - origin))
-
-    def as_mapping(self) -> dict[str, list[float]]:
-        """Return it as the key `frame` of a body map."""
-        turn = Rotation.from_matrix(self.rotation.T).as_quat(canonical=True)
-        origin = -self.rotation.T @ self.translation
-        return {"position": origin.round(5).tolist(), "rotation": turn.round(6).tolist()}
-
     @classmethod
     def from_mapping(cls, entry: dict[str, Any]) -> BaseFrame:
         """Read where the origin and the axes of `limb_base` are in the frame of the poses, in m.
@@ -169,7 +159,12 @@ class BodyMap:
         if not limb:
             raise BodyMapError("bodies: at least one must have an arc_length on the limb")
         fixed = tuple(body for body in found if isinstance(body, FixedBody))
-        frame = data.get("frame")
+        frame = BaseFrame.from_mapping(section(data, "frame")) if "frame" in data else None
+        if not fixed and frame is None:
+            raise BodyMapError(
+                "bodies: at least one must have 'place: clamp' or 'place: world', or the key frame "
+                "must say where limb_base is"
+            )
         return cls(
             segment_lengths=lengths,
             limb=limb,
@@ -178,7 +173,7 @@ class BodyMap:
             stiff=stiff,
             unit=LENGTH_UNITS[unit],
             up=tuple(AXES[up].tolist()),
-            frame=None if frame is None else BaseFrame.from_mapping(section(data, "frame")),
+            frame=frame,
         )
 
 

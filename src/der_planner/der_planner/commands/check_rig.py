@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from apriltag_tracker.bodies.body_map import BaseFrame, BodyMap, BodyMapError
+from apriltag_tracker.bodies.body_map import BodyMap, BodyMapError
 from apriltag_tracker.pose.clamp import Clamp, find_clamp
 from apriltag_tracker.tag_map import LimbTag, TagMap, TagMapError
 from der_planner.bags.reader import BagError, BagReader
@@ -97,19 +97,9 @@ def _main(given: argparse.Namespace) -> int:
     lines = finding.lines()
     offsets = [body.offset for body in bodies.limb]
     clamp = find_clamp(bodies, log.arc_lengths, offsets, log.places)
-    told = _tracker_values(bag) if isinstance(bodies, BodyMap) else {}
-    if "plane_tilt_deg" in told:
-        lines.append(
-            f"plane of motion: tilted by {told['plane_tilt_deg']}° toward "
-            f"{told['plane_tilt_toward_deg']}°, bodies leave it by {told['out_of_plane_mm_rms']} mm"
-        )
-    frame = None
     if clamp is not None and not finding.contradictions:
         lines += clamp_lines(clamp)
-        if isinstance(bodies, BodyMap) and not bodies.fixed and "frame" in told:
-            height = float(np.mean([body.height for body in bodies.limb]))
-            frame = found_frame(clamp, told, height)
-            lines.append("limb_base: found from the limb, for a map without fixed bodies")
+    lines += _plane_line(bag)
     print("\n".join(lines))
     try:
         wiring = played_wiring(finding, hardware.driver if hardware else {})
@@ -121,50 +111,24 @@ def _main(given: argparse.Namespace) -> int:
         content["driver"] = {**content.get("driver", {}), "wiring": wiring}
         content["found"] = lines
         given.out.parent.mkdir(parents=True, exist_ok=True)
-        if frame is not None and hardware is not None and hardware.poses is not None:
-            mapped = yaml.safe_load(Path(hardware.poses["body_map"]).read_text())
-            path = given.out.with_name(f"{given.out.stem}_bodies.yaml").resolve()
-            path.write_text(yaml.safe_dump(mapped | {"frame": frame}, sort_keys=False))
-            content["poses"] = {**hardware.poses, "body_map": str(path)}
-            print(f"body map: {path}")
         given.out.write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True))
         print(f"rig file: {given.out}")
     return 0
 
 
-def found_frame(clamp: Clamp, told: Mapping[str, str], height: float) -> dict[str, list[float]]:
-    """Return the key `frame` of a body map: at the clamp, with z across the plane of motion.
-
-    Args:
-        clamp: found in the frame that the tracker of bodies had.
-        told: its diagnostics: that frame, and the plane's tilt.
-        height: of the bodies [m].
-    """
-    tilt, toward = (
-        float(np.radians(float(told.get(key, 0.0))))
-        for key in ("plane_tilt_deg", "plane_tilt_toward_deg")
-    )
-    x, y, heading = clamp.place
-    up = np.array([np.sin(tilt) * np.cos(toward), np.sin(tilt) * np.sin(toward), np.cos(tilt)])
-    along = np.array([np.cos(heading), np.sin(heading), 0.0])
-    along -= up * (up @ along)
-    along /= np.linalg.norm(along)
-    axes = np.column_stack([along, np.cross(up, along), up])
-    before = BaseFrame.from_mapping(yaml.safe_load(told["frame"]))
-    # The clamp was seen in the bodies' plane, which is that far above the centreline's.
-    origin = np.array([x, y, 0.0]) + height * (np.array([0.0, 0.0, 1.0]) - up)
-    return before.moved(origin, axes).as_mapping()
-
-
-def _tracker_values(bag: Path) -> dict[str, str]:
-    """Return the last diagnostics of the tracker of bodies."""
-    found: dict[str, str] = {}
+def _plane_line(bag: Path) -> list[str]:
+    """Return what the tracker of bodies has found of the plane of motion, if it has."""
+    told: dict[str, str] = {}
     with BagReader(bag) as reader:
         for _, _, message in reader.messages([topics.DIAGNOSTICS]):
             for status in message.status:
-                if status.name.endswith("pose_tracker"):
-                    found = {entry.key: entry.value for entry in status.values}
-    return found
+                told.update({entry.key: entry.value for entry in status.values})
+    if "plane_tilt_deg" not in told:
+        return []
+    return [
+        f"plane of motion: tilted by {told['plane_tilt_deg']}° toward "
+        f"{told['plane_tilt_toward_deg']}°, bodies leave it by {told['out_of_plane_mm_rms']} mm"
+    ]
 
 
 def clamp_lines(clamp: Clamp) -> list[str]:
