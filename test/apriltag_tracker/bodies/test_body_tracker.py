@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from apriltag_tracker.bodies.base import PlaneWatch, fit_frame
-from apriltag_tracker.bodies.body_map import AXES, BodyMap, BodyMapError
+from apriltag_tracker.bodies.body_map import AXES, BodyMap
 from apriltag_tracker.bodies.tracker import BodyNoise, BodyTracker, FrameAssembler
 from apriltag_tracker.pose.following import FollowerOptions, Uncertainty
 from apriltag_tracker.synthetic.poses import MocapFaults, SyntheticMocap
+from apriltag_tracker.tag_map import MapError
 
 PERIOD = 1.0 / 120.0
 NOISE = MocapFaults(position_noise=1e-4, direction_noise=3e-3)
@@ -201,5 +202,5 @@ def test_wrong_maps_are_named(bodies):
         ({"bodies": [{**on_limb, "rotation": [0, 0, 0, 2]}]}, "no quaternion"),
         ({"bodies": [{"name": "a", "place": "world", "position": [0, 0, 0]}]}, "arc_length"),
     ):
-        with pytest.raises(BodyMapError, match=said):
+        with pytest.raises(MapError, match=said):
             BodyMap.from_dict({"schema": 1, "limb": limb, "bodies": [on_limb], **change})

@@ -146,7 +146,7 @@ class BodyTracker:
         noise = noise or BodyNoise()
         self._covariance = np.diag([noise.position, noise.position, noise.direction]) ** 2
         self.base = BaseFinder(bodies)
-        fixed = np.array([body.position[:2] for body in bodies.fixed] or [[0.0, 0.0]])
+        fixed = np.array([body.position[:2] for body in bodies.fixed] or [np.zeros(2)])
         survey, least = self._options.uncertainty.survey, 0.01 if len(fixed) > 1 else bodies.length
         self._shared = partial(survey_errors, fixed=fixed, survey=survey, least_spread=least)
         self.plane = PlaneWatch(np.array([body.height for body in bodies.limb]))

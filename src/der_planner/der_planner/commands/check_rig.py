@@ -23,9 +23,9 @@ from typing import Any
 import numpy as np
 import yaml
 
-from apriltag_tracker.bodies.body_map import BodyMap, BodyMapError
+from apriltag_tracker.bodies.body_map import BodyMap
 from apriltag_tracker.pose.clamp import Clamp, find_clamp
-from apriltag_tracker.tag_map import LimbTag, TagMap, TagMapError
+from apriltag_tracker.tag_map import LimbTag, MapError, TagMap
 from der_planner.bags.reader import BagError, BagReader
 from der_planner.bags.record import PRESSURE_TYPE, Columns, header_stamp
 from der_planner.experiment.console import (
@@ -57,7 +57,7 @@ SEEN_TOGETHER = 10
 def main() -> int:
     """Run the command line."""
     given = _parser().parse_args()
-    errors = (RigError, BagError, BodyMapError, TagMapError, TwinError, GraphError, NodeError)
+    errors = (RigError, BagError, MapError, TwinError, GraphError, NodeError)
     return run_command(lambda: _main(given), *errors, OSError, stopped="no rig file was written")
 
 

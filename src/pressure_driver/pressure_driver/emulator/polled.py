@@ -128,14 +128,6 @@ class FestoBoard(BoardProtocol):
             for chamber, value in enumerate(pressure)
         ]
 
-    def _registers(self, first: int, count: int, reading: BoardReading) -> list[int]:
-        """Return what registers hold, or nothing if there are none of these numbers."""
-        held = ((FIRST_OUTPUT, self._outputs), (FIRST_INPUT, self._inputs(reading)))
-        for begin, registers in held:
-            if begin <= first and first + count <= begin + len(registers):
-                return registers[first - begin : first - begin + count]
-        return []
-
     def _inputs(self, reading: BoardReading) -> list[int]:
         measured = [
             round((pressure - reading.atmosphere) / PASCAL_PER_MILLIBAR)
@@ -157,9 +149,10 @@ class FestoBoard(BoardProtocol):
             return modbus.encode(number, first | modbus.FAILED, bytes([second]))
         if command.kind == "setpoint":
             return modbus.encode(number, modbus.WRITE, modbus.BLOCK.pack(first, second))
-        data = modbus.to_bytes(self._registers(first, second, reading))
-        if not data:
+        words, offset = self._inputs(reading), first - FIRST_INPUT
+        if not 0 <= offset <= len(words) - second:
             return modbus.encode(number, modbus.READ | modbus.FAILED, bytes([ILLEGAL_ADDRESS]))
+        data = modbus.to_bytes(words[offset : offset + second])
         return modbus.encode(number, modbus.READ, bytes([len(data)]) + data)
 
     def expired(self) -> bytes:
