@@ -98,7 +98,8 @@ def main() -> None:
     cases = [(name, {}) for name in NAMES]
     for name, parameters in [*cases, ("pneudrive", {"sensor_range": 103_400.0})]:
         error = 100.0 * tip_error(planned, name, **parameters)
-        print(f"{name:10s} {str(parameters or ''):26s} tip error {error:.3f} cm", flush=True)
+        told = parameters.get("sensor_range", "")
+        print(f"{name:10s} {told:>8} tip error {error:.3f} cm", flush=True)
     for name, fault in [*((name, "") for name in NAMES), ("festo", "hold")]:
         seconds = seconds_until_vented(name, fault)
         told = f"vented after {seconds:.1f} s" if math.isfinite(seconds) else "keeps its pressures"
