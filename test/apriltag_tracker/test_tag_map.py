@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import yaml
 
-from apriltag_tracker.tag_map import TagMap, TagMapError, WorldTag
+from apriltag_tracker.tag_map import MapError, TagMap, WorldTag
 
 
 @pytest.fixture
@@ -51,17 +51,17 @@ def _set(*path, value):
 def test_impossible_maps_are_refused_by_name(content, change, message):
     content = copy.deepcopy(content)
     change(content)
-    with pytest.raises(TagMapError, match=message):
+    with pytest.raises(MapError, match=message):
         TagMap.from_dict(content)
 
 
 def test_files_are_named(tmp_path):
-    with pytest.raises(TagMapError, match="nowhere"):
+    with pytest.raises(MapError, match="nowhere"):
         TagMap.from_yaml(tmp_path / "nowhere.yaml")
     path = tmp_path / "tags.yaml"
     path.write_text("[1, 2")
-    with pytest.raises(TagMapError, match="not YAML"):
+    with pytest.raises(MapError, match="not YAML"):
         TagMap.from_yaml(path)
     path.write_text("schema: 2")
-    with pytest.raises(TagMapError, match=r"tags\.yaml.*schema"):
+    with pytest.raises(MapError, match=r"tags\.yaml.*schema"):
         TagMap.from_yaml(path)

@@ -1,4 +1,4 @@
-"""Boards that are asked: how a terminal is started, its registers, and boards that share a bus."""
+"""Boards that are asked: how a terminal is started, its registers, and coarse sensors."""
 
 import struct
 
@@ -7,7 +7,7 @@ import pytest
 from waiting import Clock
 
 from pressure_driver.emulator.device import BoardReading
-from pressure_driver.emulator.polled import FestoBoard, PneudriveBoard
+from pressure_driver.emulator.polled import FestoBoard
 from pressure_driver.protocols import BoardFailure, Echo, Telemetry, host_protocol, modbus
 from pressure_driver.safety import Mode
 from pressure_driver.settings import Settings
@@ -36,7 +36,7 @@ def told(data):
 
 def test_setpoints_of_a_motion_terminal_stand_behind_the_mode_of_their_slot():
     host = host_protocol("festo")
-    data, number = host.setpoint([7_540.0, -20_000.0], ROOM, 0.25)
+    data, number = host.setpoint([7_540.0, 0.0, 0.0, 20_000.0], ROOM, 0.25)
     assert told(data) == (40003, (0xC3, 75, 0, 0xC3, 0, 200))
     assert host.follow_up() == b""
     assert host.decode(modbus.encode(number, modbus.WRITE, struct.pack(">HH", 40003, 6))) == [
@@ -115,50 +115,20 @@ def test_a_diagnosis_of_a_regulator_is_a_failure():
     assert failure == BoardFailure("valve 3 reports: diagnosis 5")
 
 
-# ---------------------------------------------------------------------------- boards on a bus
+# -------------------------------------------------------------------------------- pneudrive
 
 
 def test_frames_of_a_pneudrive_board():
     host = host_protocol("pneudrive")
-    data, _ = host.setpoint([68_950.0, 0.0], ROOM, 0.25)
+    data, _ = host.setpoint([68_950.0, 0.0, 0.0, 0.0], ROOM, 0.25)
     assert data == bytes.fromhex("ffff 00b8 0066 0066 0066")
-    assert host.setpoint([1e6, 0.0], ROOM, 0.25)[0][2:4] == (1023).to_bytes(2, "big")
+    assert host.setpoint([1e6, 0.0, 0.0, 0.0], ROOM, 0.25)[0][2:4] == (1023).to_bytes(2, "big")
     (reading,) = [
         event
         for event in host.decode(bytes.fromhex("ffff 00b8 0066 0066 0066"))
         if isinstance(event, Telemetry)
     ]
     assert reading.chamber_pressure == pytest.approx((ROOM + 68_950.0, ROOM, ROOM, ROOM), abs=700.0)
-
-
-def served(host, boards, data, silent=()):
-    """Pass frames to and fro until nobody speaks; return the boards that were spoken to."""
-    asked, events = [], []
-    reading = BoardReading(5.0, (ROOM,) * 12, ROOM, (0.0,) * 12, 0.0)
-    while data:
-        asked.append(0xFFFF - int.from_bytes(data[:2], "big"))
-        assert len(data) == 10, "two boards must not be spoken to at once"
-        (command,) = boards.decode(data)
-        answers = b"" if asked[-1] in silent else boards.reply(command, reading)
-        events += host.decode(answers)
-        data = host.follow_up()
-    return asked, events
-
-
-def test_a_board_on_the_bus_is_spoken_to_when_the_one_before_has_answered():
-    host, boards = host_protocol("pneudrive", 12), PneudriveBoard(12)
-    asked, events = served(host, boards, host.vent(ROOM)[0])
-    assert asked == [0, 1, 2]
-    assert [type(event) for event in events] == [Echo, Telemetry]
-    assert len(events[1].chamber_pressure) == 12
-
-
-def test_a_silent_board_on_the_bus_keeps_no_other_from_its_targets():
-    host, boards = host_protocol("pneudrive", 12), PneudriveBoard(12)
-    rounds = [served(host, boards, host.vent(ROOM)[0], silent=[1]) for _ in range(3)]
-    assert [asked for asked, _ in rounds] == [[0, 1], [2, 0, 1], [2, 0, 1]]
-    assert not [event for _, events in rounds for event in events], "no telemetry: a fault"
-    assert [frame[:2] for frame in host.emergency(ROOM)] == [b"\xff\xff", b"\xff\xfe", b"\xff\xfd"]
 
 
 def test_a_limb_on_coarse_sensors_is_armed_and_played(simulate):

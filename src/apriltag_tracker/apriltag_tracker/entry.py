@@ -22,4 +22,4 @@ def pose_tracker() -> int:
 
 def synthetic_poses() -> int:
     """Run the simulated motion capture."""
-    return int(run_module("apriltag_tracker.synthetic.mocap.node"))
+    return int(run_module("apriltag_tracker.synthetic.nodes.poses"))

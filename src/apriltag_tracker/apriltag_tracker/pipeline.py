@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 from apriltag_tracker.camera import CameraPose, Intrinsics
 from apriltag_tracker.detection import Detector, Tag
 from apriltag_tracker.detection.tracking import FULL_SEARCH_PERIOD, TagTracker
-from apriltag_tracker.pose.following import FollowerOptions, LimbFollower
+from apriltag_tracker.pose.following import FollowerOptions, LimbFollower, survey_errors
 from apriltag_tracker.pose.plane import locate, pose_moves
 from apriltag_tracker.pose.shape import LimbEstimate, PlanarTag, centreline_pose
 from apriltag_tracker.pose.world import WorldPose
@@ -170,20 +169,14 @@ class LimbTracker:
         These are the survey's shift in x and y and its turn, which average over the fixed tags, and
         the height, which moves a tag away from the point below the camera.
         """
-        uncertainty = self.options.uncertainty
-        shift = uncertainty.survey / math.sqrt(len(self._world_positions))
-        middle = self._world_positions.mean(axis=0)
-        spread = math.sqrt(float(np.sum((self._world_positions - middle) ** 2)))
+        uncertainty, origin = self.options.uncertainty, pose.position
         # One fixed tag alone says where the base turns to by its own corners only.
-        turn = uncertainty.survey / max(spread, self._world_size)
-        arm = places[:, :2] - middle
-        origin = pose.position
-        moves = np.zeros((len(places), 3, 4))
-        moves[:, 0, 0] = moves[:, 1, 1] = shift
-        moves[:, 0, 2], moves[:, 1, 2], moves[:, 2, 2] = -turn * arm[:, 1], turn * arm[:, 0], turn
+        surveyed = survey_errors(
+            places, self._world_positions, uncertainty.survey, self._world_size
+        )
         outward = (places[:, :2] - origin[:2]) / (heights - origin[2])[:, None]
-        moves[:, :2, 3] = uncertainty.height * outward
-        return moves
+        raised = uncertainty.height * np.column_stack([outward, np.zeros(len(places))])
+        return np.concatenate([surveyed, raised[:, :, None]], axis=2)
 
 
 def warm_up(detector: Detector) -> None:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import yaml
@@ -20,7 +21,7 @@ UNIT_CORNERS = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
 """Corners of a tag of size 1 in its own frame: lower left, lower right, upper right, upper left."""
 
 
-class TagMapError(ValueError):
+class MapError(ValueError):
     """The tag map is incomplete or impossible; the message names file, key and remedy."""
 
 
@@ -84,7 +85,7 @@ class TagMap:
     def __post_init__(self) -> None:
         twice = sorted({tag for tag in self.ids if self.ids.count(tag) > 1})
         if twice:
-            raise TagMapError(
+            raise MapError(
                 f"tag ids {twice} occur twice in the tag map: every tag needs its own id"
             )
 
@@ -111,71 +112,84 @@ class TagMap:
             family: name of the tags' family, None for the one that the file names.
 
         Raises:
-            TagMapError: the file is missing, is no YAML, or a key is missing or impossible.
+            MapError: the file is missing, is no YAML, or a key is missing or impossible.
         """
-        path = Path(path)
-        try:
-            data = yaml.safe_load(path.read_text())
-        except OSError as error:
-            raise TagMapError(f"cannot read the tag map {path}: {error.strerror}") from error
-        except yaml.YAMLError as error:
-            raise TagMapError(f"the tag map {path} is not YAML: {error}") from error
-        try:
+
+        def build(data: Any) -> TagMap:
             if family is not None and isinstance(data, dict):
                 data["family"] = family
             return cls.from_dict(data)
-        except TagMapError as error:
-            raise TagMapError(f"{path}: {error}") from error
+
+        return read_map(path, build)
 
     @classmethod
     def from_dict(cls, data: Any) -> TagMap:
-        """Build a tag map from the content of its file; raises `TagMapError`."""
+        """Build a tag map from the content of its file; raises `MapError`."""
         if not isinstance(data, dict) or data.get("schema") != SCHEMA_VERSION:
-            raise TagMapError(f"'schema: {SCHEMA_VERSION}' expected at the top of a tag map")
+            raise MapError(f"'schema: {SCHEMA_VERSION}' expected at the top of a tag map")
         try:
             family = families.named(data.get("family"))
         except ValueError as error:
-            raise TagMapError(str(error)) from error
+            raise MapError(str(error)) from error
         limb = section(data, "limb")
         world = section(data, "world")
         lengths, stiff = limb_geometry(limb)
         total = sum(lengths)
         limb_tags = tuple(_limb_tag(entry, total, family) for entry in limb.get("tags") or [])
         if not limb_tags:
-            raise TagMapError("limb.tags is empty: at least one tag must be on the limb")
+            raise MapError("limb.tags is empty: at least one tag must be on the limb")
         world_tags = tuple(_world_tag(entry, family) for entry in world.get("tags") or [])
         return cls(lengths, limb_tags, world_tags, stiff, family)
+
+
+_Map = TypeVar("_Map")
+
+
+def read_map(path: str | Path, build: Callable[[Any], _Map]) -> _Map:
+    """Return what ``build`` makes of the content of a map's file.
+
+    Raises:
+        MapError: the file is missing, is no YAML, or a key is missing or impossible.
+    """
+    try:
+        return build(yaml.safe_load(Path(path).read_text()))
+    except OSError as error:
+        raise MapError(f"cannot read the map {path}: {error.strerror}") from error
+    except yaml.YAMLError as error:
+        raise MapError(f"the map {path} is not YAML: {error}") from error
+    except MapError as error:
+        raise MapError(f"{path}: {error}") from error
 
 
 def limb_geometry(
     limb: dict[str, Any],
 ) -> tuple[tuple[float, ...], tuple[tuple[float, float], ...]]:
-    """Read the segments' lengths and the stiff stretches [m] of a map; raises `TagMapError`."""
+    """Read the segments' lengths and the stiff stretches [m] of a map; raises `MapError`."""
     lengths = tuple(floats(limb.get("segment_lengths"), None, "limb.segment_lengths"))
     if not lengths or min(lengths) <= 0.0:
-        raise TagMapError("limb.segment_lengths: a list of positive lengths in m expected")
+        raise MapError("limb.segment_lengths: a list of positive lengths in m expected")
     return lengths, _stiff(limb.get("stiff") or [], lengths)
 
 
 def section(data: dict[str, Any], name: str) -> dict[str, Any]:
-    """Return a part of a map that must be there; raises `TagMapError`."""
+    """Return a part of a map that must be there; raises `MapError`."""
     found = data.get(name)
     if not isinstance(found, dict):
-        raise TagMapError(f"section '{name}' is missing")
+        raise MapError(f"section '{name}' is missing")
     return found
 
 
 def floats(value: Any, count: int | None, name: str) -> list[float]:
-    """Return a list of ``count`` finite numbers, of any count if None; raises `TagMapError`."""
+    """Return a list of ``count`` finite numbers, of any count if None; raises `MapError`."""
     if not isinstance(value, list) or (count is not None and len(value) != count):
-        raise TagMapError(f"{name}: a list of {count or 'some'} numbers expected, not {value!r}")
+        raise MapError(f"{name}: a list of {count or 'some'} numbers expected, not {value!r}")
     return [number(entry, name) for entry in value]
 
 
 def number(value: Any, name: str) -> float:
-    """Return a finite number; raises `TagMapError`."""
+    """Return a finite number; raises `MapError`."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise TagMapError(f"{name}: a finite number expected, not {value!r}")
+        raise MapError(f"{name}: a finite number expected, not {value!r}")
     return float(value)
 
 
@@ -184,7 +198,7 @@ def _stiff(value: Any, lengths: tuple[float, ...]) -> tuple[tuple[float, float],
     for entry in value if isinstance(value, list) else [value]:
         start, end = floats(entry, 2, "limb.stiff")
         if not (result[-1][1] if result else 0.0) <= start < end <= sum(lengths) + 1e-9:
-            raise TagMapError(f"limb.stiff: {entry} is out of order or not on the limb")
+            raise MapError(f"limb.stiff: {entry} is out of order or not on the limb")
         result.append((start, end))
     begin = 0.0
     for length in lengths:
@@ -192,24 +206,24 @@ def _stiff(value: Any, lengths: tuple[float, ...]) -> tuple[tuple[float, float],
             max(0.0, min(end, begin + length) - max(start, begin)) for start, end in result
         )
         if covered > 0.5 * length:
-            raise TagMapError("limb.stiff covers more than half of a segment: nothing could bend")
+            raise MapError("limb.stiff covers more than half of a segment: nothing could bend")
         begin += length
     return tuple(result)
 
 
 def _common(entry: Any, where: str, family: Family) -> tuple[int, float, str]:
     if not isinstance(entry, dict):
-        raise TagMapError(f"{where}: an entry 'id: …, size: …' expected, not {entry!r}")
+        raise MapError(f"{where}: an entry 'id: …, size: …' expected, not {entry!r}")
     tag = entry.get("id")
     if not isinstance(tag, int) or not 0 <= tag < family.tag_count:
-        raise TagMapError(
+        raise MapError(
             f"{where}: id {tag!r} is not one of 0 to {family.tag_count - 1}, which "
             f"{family.name} has"
         )
     name = f"{where} {tag}"
     size = number(entry.get("size"), f"{name}: size")
     if size <= 0.0:
-        raise TagMapError(f"{name}: size {size} m must be positive")
+        raise MapError(f"{name}: size {size} m must be positive")
     return tag, size, name
 
 
@@ -217,7 +231,7 @@ def _limb_tag(entry: Any, total: float, family: Family) -> LimbTag:
     tag, size, name = _common(entry, "limb tag", family)
     arc_length = number(entry.get("arc_length"), f"{name}: arc_length")
     if not 0.0 <= arc_length <= total:
-        raise TagMapError(f"{name}: arc_length {arc_length} m is not on the limb (0 to {total} m)")
+        raise MapError(f"{name}: arc_length {arc_length} m is not on the limb (0 to {total} m)")
     offset = floats(entry.get("offset", [0.0, 0.0, 0.0]), 3, f"{name}: offset")
     height = number(entry.get("height"), f"{name}: height")
     return LimbTag(tag, arc_length, height, size, (offset[0], offset[1], offset[2]))

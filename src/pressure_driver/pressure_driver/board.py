@@ -203,7 +203,7 @@ class BoardProcess:
         """Vent before the next tick, and before all that waits to be sent."""
         answer = self.core.vent()
         self._drop_unsent()
-        self._write(self.core.emergency()[0])
+        self._write(self.core.emergency())
         return answer
 
     def _show_life(self) -> None:
@@ -229,9 +229,8 @@ class BoardProcess:
         self._unread = Duration()
         self._write(self.core.opening())
         if self._line is not None:
-            commands = [command.hex() for command in self.core.emergency()]
             descriptor = self._line.fileno() if self._line.shared else None
-            self._send("port", commands, descriptor=descriptor)
+            self._send("port", self.core.emergency().hex(), descriptor=descriptor)
 
     def _look_for_port(self) -> None:
         """Open a port that was lost as soon as its name is there again."""

@@ -8,10 +8,10 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from pressure_driver.following import chamber_gauge
-from pressure_driver.hoses import Hoses
+from pressure_driver.following import chamber_gauge, valves_of
 from pressure_driver.protocols import (
     STANDARD_ATMOSPHERE,
     BoardFailure,
@@ -147,7 +147,7 @@ class DriverCore:
         self.machine = SafetyMachine(settings, self.monitor, self._conditions)
         self.board = BoardWatch(protocol, settings)
         self._settings = settings
-        self._hoses = Hoses(settings.wiring, settings.segment_count) if settings.wiring else None
+        self._valves = valves_of(settings.wiring, protocol.chamber_count)
         self._log = log
         self._link_fault = "the serial port is not open"
         self._texts: deque[str] = deque()
@@ -266,9 +266,9 @@ class DriverCore:
         if self.venting:
             self.machine.command_nothing()
             return self.board.greeting(now) + self._vent_bytes()
-        asked = self.machine.differential
+        asked = dict(zip(self._valves, chamber_gauge(self.machine.differential), strict=True))
         data, self._pending_number = self.protocol.setpoint(
-            asked if self._hoses is None else self._hoses.to_board(asked),
+            [asked[valve] for valve in sorted(asked)],
             self._wire_atmosphere(),
             self._settings.command_validity,
         )
@@ -283,8 +283,8 @@ class DriverCore:
         if self._texts:
             self._log(f"board: {self._texts.popleft()}", False)
 
-    def emergency(self) -> list[bytes]:
-        """Return the vent commands, complete after any half-sent bytes, to be sent in turn."""
+    def emergency(self) -> bytes:
+        """Return the vent command, complete after any half-sent bytes."""
         return self.protocol.emergency(self._wire_atmosphere())
 
     def _wire_atmosphere(self) -> float:
@@ -324,8 +324,11 @@ class DriverCore:
 
     def _serve(self, event: Event, now: float) -> None:
         if isinstance(event, Telemetry):
-            if self._hoses is not None:
-                event = self._hoses.from_board(event)
+            event = replace(
+                event,
+                chamber_pressure=self._of_chambers(event.chamber_pressure),
+                valve_opening=self._of_chambers(event.valve_opening),
+            )
             # Rest pressures are measured only where nothing has been asked of the chambers.
             self.monitor.receive(event, now, self.machine.mode in (Mode.DISARMED, Mode.FAULT))
         elif isinstance(event, Echo):
@@ -340,6 +343,10 @@ class DriverCore:
         elif isinstance(event, BoardText):
             self.last_text = event.text
             self._log_text(event.text)
+
+    def _of_chambers(self, told: tuple[float, ...] | None) -> tuple[float, ...] | None:
+        """Return what a board tells of its valves in the order of the limb's chambers."""
+        return told and tuple(told[valve] for valve in self._valves)
 
     def _set_up_anew(self, reset: BoardReset, now: float) -> None:
         """Greet a board that has been reset; what was being played must not be played on."""

@@ -25,6 +25,12 @@ def chamber_gauge(differential: Sequence[float]) -> list[float]:
     return [gauge for value in differential for gauge in (max(value, 0.0), max(-value, 0.0))]
 
 
+def valves_of(wiring: str, chamber_count: int) -> tuple[int, ...]:
+    """Return the valve of each chamber (2M,), counted from 0, for the parameter ``wiring``."""
+    named = tuple(int(word) - 1 for word in wiring.replace(",", " ").split())
+    return named or tuple(range(chamber_count))
+
+
 class Duration:
     """How long something has gone on without a break."""
 

@@ -26,7 +26,7 @@ RELEASE_TIME = 4.0
 VENT_TIME = 1.0
 """[s] for which one process of the driver vents in the place of the other."""
 VENT_PERIOD = 0.05
-"""[s] in which each vent command is sent once, by a process that vents in the place of another."""
+"""[s] between two vent commands of a process that vents in the place of another."""
 CONNECT_TIME = 0.1
 """[s] for a connection: a board in the same room answers in 0.001 s, and meanwhile nothing runs."""
 ADVICE = "close the air supply"
@@ -216,14 +216,13 @@ def open_line(port: str, baud_rate: int, patience: float = 0.0) -> Line:
         time.sleep(0.1)
 
 
-def vent_line(descriptor: int, commands: list[bytes], duration: float) -> str:
-    """Send the vent commands again and again, before all that waits to be sent.
+def vent_line(descriptor: int, command: bytes, duration: float) -> str:
+    """Send the vent command again and again, before all that waits to be sent.
 
     Args:
         descriptor: of the open line; −1 if there is none.
-        commands: open every chamber, complete after any half-sent bytes. They are sent in turn: a
-            board on a bus must have answered before the next is spoken to.
-        duration: [s] for which they are repeated: bytes may be damaged.
+        command: opens every chamber, complete after any half-sent bytes.
+        duration: [s] for which it is repeated: bytes may be damaged.
 
     Returns:
         What is left to be done, or nothing if the last command has left.
@@ -234,26 +233,25 @@ def vent_line(descriptor: int, commands: list[bytes], duration: float) -> str:
     try:
         _flush(descriptor)
         while time.monotonic() < end:
-            for command in commands:
-                try:
-                    taken = os.write(descriptor, command) == len(command)
-                except BlockingIOError:
-                    taken = False
-                    _flush(descriptor)
-                time.sleep(VENT_PERIOD / len(commands))
+            try:
+                taken = os.write(descriptor, command) == len(command)
+            except BlockingIOError:
+                taken = False
+                _flush(descriptor)
+            time.sleep(VENT_PERIOD)
         waiting = _waiting(descriptor)
     except (OSError, termios.error) as error:
         return f"the port is gone ({error}): {ADVICE}"
     return "" if taken and not waiting else f"the board takes no bytes: {ADVICE}"
 
 
-def vent_anew(port: str, commands: list[bytes], duration: float) -> str:
+def vent_anew(port: str, command: bytes, duration: float) -> str:
     """Vent over a connection of its own, as `vent_line` does; return what is left to be done."""
     try:
         line = Line(port, alone=False)
     except OSError as error:
         return f"the board cannot be reached ({error}): {ADVICE}"
-    problem = vent_line(line.fileno(), commands, duration)
+    problem = vent_line(line.fileno(), command, duration)
     line.close(drop=bool(problem))
     return problem
 

@@ -135,7 +135,7 @@ class PortProcess:
         self._settings = replace(settings, port=stable_name(settings.port))
         self._on_message = on_message
         self._answers: queue.Queue[tuple[bool, str]] = queue.Queue()
-        self._vent_commands: list[bytes] = []
+        self._vent_command = b""
         self._descriptor = -1
         self._outcome: str | None = None
         self._thread = threading.Thread(target=self._listen, name="port process", daemon=True)
@@ -228,9 +228,9 @@ class PortProcess:
             self._process.wait(LOOK)
         if self._outcome is None:
             if is_tcp(self._settings.port):
-                problem = lines.vent_anew(self._settings.port, self._vent_commands, lines.VENT_TIME)
+                problem = lines.vent_anew(self._settings.port, self._vent_command, lines.VENT_TIME)
             else:
-                problem = lines.vent_line(self._descriptor, self._vent_commands, lines.VENT_TIME)
+                problem = lines.vent_line(self._descriptor, self._vent_command, lines.VENT_TIME)
             told = f"the vent command was sent for {lines.VENT_TIME:g} s; see that it has vented"
             self.error = f"{reason}: {problem or told}"
         lines.release_descriptor(self._descriptor)
@@ -243,7 +243,7 @@ class PortProcess:
                 os.close(self._descriptor)
             self._descriptor = -1 if descriptor is None else descriptor
         if word == "port":
-            self._vent_commands = [bytes.fromhex(text) for text in content[0]]
+            self._vent_command = bytes.fromhex(content[0])
         elif word == "state":
             self.states.append(content[0])
         elif word == "log":

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from dataclasses import MISSING, Field, dataclass, field, fields
 from typing import Any, NamedTuple, TypeVar
 
-from pressure_driver.hoses import HoseError, Hoses
+from pressure_driver.following import valves_of
 from pressure_driver.protocols import NAMES
 
 TERMINALS = ("vtem", "mpa")
@@ -157,11 +157,25 @@ class Settings:
                     f"parameters '{low}' ({below:g} Pa) and '{high}' ({above:g} Pa): the first "
                     f"must be smaller{reason}"
                 )
-        if self.wiring:
-            try:
-                Hoses(self.wiring, self.segment_count)
-            except HoseError as error:
-                raise SettingError(f"parameter 'wiring': {error}") from error
+        count = 2 * self.segment_count
+        try:
+            valves = valves_of(self.wiring, count)
+        except ValueError:
+            valves = ()
+        if sorted(valves) != list(range(count)):
+            raise SettingError(
+                f"parameter 'wiring' is '{self.wiring}': name each of the valves 1 to {count} "
+                "once, in the order of the limb's chambers"
+            )
+        if self.protocol == "ezloop" and any(
+            left // 2 != right // 2 for left, right in zip(valves[0::2], valves[1::2], strict=True)
+        ):
+            raise SettingError(
+                f"parameter 'wiring' is '{self.wiring}': an `ezloop` board vents one valve of each "
+                "pair 1 and 2, 3 and 4: put the hoses of each segment on one pair"
+            )
+        if self.protocol == "pneudrive" and self.segment_count > 2:
+            raise SettingError("parameter 'segment_count': a `pneudrive` board has four valves")
         if self.command_validity * self.rate <= 1.0:
             raise SettingError(
                 f"parameters 'command_validity' ({self.command_validity:g} s) and 'rate' "

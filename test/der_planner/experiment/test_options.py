@@ -1,5 +1,6 @@
 """The experiment's command line: what is refused, and what order trials are played in."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -46,12 +47,16 @@ def test_hardware_without_its_serial_device_is_refused(tmp_path: Path):
 
 def test_a_node_of_another_computer_is_marked_and_keeps_its_parameters_there(tmp_path: Path):
     rig = tmp_path / "rig.yaml"
-    rig.write_text("driver: {port: tcp://valves:502}\ntracker: {host: camera-pc}\n")
+    rig.write_text(
+        "driver: {port: tcp://valves:502, wiring: '2,1,4,3'}\ntracker: {host: camera-pc}\n"
+    )
     hardware = Hardware.from_yaml(rig)
     nodes = GraphSetup(tmp_path, {}, hardware=hardware).nodes("")
     assert {node.executable: node.host for node in nodes if node.host} == {
         "apriltag_tracker": "camera-pc"
     }
+    (recorder,) = (node for node in nodes if node.executable == "recorder")
+    assert json.loads(recorder.parameters["metadata"])["wiring"] == "2,1,4,3"
     rig.write_text("driver: {host: valve-pc}\n")
     assert Hardware.from_yaml(rig).place == "valve-pc"
     rig.write_text("driver: {host: valve-pc, port: /dev/ttyACM0}\n")

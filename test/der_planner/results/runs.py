@@ -152,7 +152,7 @@ class BagOfRun:
         about = {"plan_id": "p", "touched": True, "since": began, "said": said}
         self.write("/limb/contact", "LimbContact", seconds, distance=distance, **about)
 
-    def command(self, seconds: float, differential, sequence: int) -> None:
+    def command(self, seconds: float, differential, sequence: int, valves=range(4)) -> None:
         chambers = np.repeat(101_300.0, 4)
         for segment, value in enumerate(differential):
             chambers[2 * segment + (value < 0)] += abs(value)
@@ -161,5 +161,5 @@ class BagOfRun:
             "ChamberPressures",
             seconds,
             sequence=sequence,
-            pressure=np.round(chambers, -2),
+            pressure=np.round(chambers, -2)[np.argsort(valves)],
         )

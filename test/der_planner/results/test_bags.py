@@ -25,7 +25,7 @@ HUNG = {"gravity": np.array([9.81, 0.0, 0.0]), "payload": 0.02, "payload_at": 0.
 OFFSET = np.array([0.003, -0.004])
 
 
-def write_run(bag: BagOfRun, first_setpoint: float = 0.0) -> None:
+def write_run(bag: BagOfRun, first_setpoint: float = 0.0, valves=range(4)) -> None:
     """Write a run in which the tip is off by 5 mm, in the order of time."""
     bag.plan(stamp=first_setpoint)
     events = [(TIMES[i], "setpoint", i) for i in range(len(TIMES))]
@@ -35,7 +35,7 @@ def write_run(bag: BagOfRun, first_setpoint: float = 0.0) -> None:
             value = 3000.0 * np.array([np.sin(when), np.cos(when)])
             bag.setpoint(what, value)
             bag.pressure(when, value, value + np.array([100.0, -50.0]))
-            bag.command(when + 0.004, value, what)
+            bag.command(when + 0.004, value, what, valves)
         else:
             bag.state(when, reference(when)[0] + OFFSET)
             bag.state(
@@ -67,6 +67,13 @@ def test_run_of_a_bag(folder: Path):
     assert result.checks["board_received"] == len(TIMES)
     assert result.checks["board_lateness_p99_s"] == pytest.approx(0.004, abs=1e-6)
     assert result.checks["board_value_error_pa"] <= 100.0
+
+
+def test_a_board_with_crossed_hoses_receives_every_setpoint(tmp_path: Path):
+    bag = BagOfRun(tmp_path / "run", run=json.dumps({"wiring": "3,1,4,2"}))
+    write_run(bag, valves=(2, 0, 3, 1))
+    bag.bag.close()
+    assert evaluate_bag(tmp_path / "run").checks["board_lost"] == 0
 
 
 def test_times_come_from_the_setpoints_not_from_arrival_or_plan(tmp_path: Path):

@@ -7,6 +7,7 @@ import pytest
 from pressure_driver.emulator.device import BoardReading
 from pressure_driver.emulator.firmware import BOARDS, NativeBoard
 from pressure_driver.emulator.polled import BUS_PATIENCE
+from pressure_driver.following import chamber_gauge
 from pressure_driver.protocols import (
     NAMES,
     BoardFailure,
@@ -65,7 +66,7 @@ def report(board, asker, reading=READING):
 
 def test_ezloop_bytes():
     host = host_protocol("ezloop")
-    assert host.setpoint([7500.0, -20.0], 101_325.0, 0.25) == (
+    assert host.setpoint([7500.0, 0.0, 0.0, 20.0], 101_325.0, 0.25) == (
         b"<1088.25,1013.25,1013.25,1013.45>\n",
         None,
     )
@@ -78,7 +79,9 @@ def test_ezloop_bytes():
 
 def test_ctrlp_bytes():
     host = host_protocol("ctrlp")
-    assert host.setpoint([7500.0, -20.0], 0.0, 0.25)[0] == (b"SET;0.050;7.500;0.000;0.000;0.020\n")
+    assert host.setpoint([7500.0, 0.0, 0.0, 20.0], 0.0, 0.25)[0] == (
+        b"SET;0.050;7.500;0.000;0.000;0.020\n"
+    )
     assert host.vent(0.0)[0] == b"SET;0.000;0.000;0.000;0.000;0.000\n"
     assert reporting_board("ctrlp").telemetry(READING) == (
         b"12345\t0\t0.00\t0.00\t0.00\t0.00\r\n12345\t1\t0.09\t7.51\t0.04\t0.03\r\n"
@@ -88,7 +91,9 @@ def test_ctrlp_bytes():
 def test_a_pair_near_the_boards_limit_is_sent_lower_with_the_same_difference():
     board = BOARDS["ezloop"]()
     for difference in (24_000.0, -24_000.0, 30_000.0):
-        data, _ = host_protocol("ezloop").setpoint([difference, 0.0], 102_900.0, 0.25)
+        data, _ = host_protocol("ezloop").setpoint(
+            chamber_gauge([difference, 0.0]), 102_900.0, 0.25
+        )
         (command,) = board.decode(data)
         assert max(command.pressure) <= 125_000.0
         assert command.pressure[0] - command.pressure[1] == pytest.approx(difference, abs=1.0)
@@ -110,7 +115,9 @@ def test_commands_arrive_as_they_were_meant(name, split):
     generator = np.random.default_rng(3) if split else None
     host, board = host_protocol(name), BOARDS[name]()
     wanted = np.random.default_rng(4).uniform(-24_000.0, 24_000.0, (60, 2))
-    stream = host.start() + b"".join(host.setpoint(u, ATMOSPHERE, 0.25)[0] for u in wanted)
+    stream = host.start() + b"".join(
+        host.setpoint(chamber_gauge(u), ATMOSPHERE, 0.25)[0] for u in wanted
+    )
     commands = [c for c in decode_all(board, stream, generator) if c.kind == "setpoint"]
     assert len(commands) == len(wanted)
     for command, difference in zip(commands, wanted, strict=True):
@@ -120,7 +127,7 @@ def test_commands_arrive_as_they_were_meant(name, split):
         assert command.valid_for in (None, 0.25, BUS_PATIENCE)
     places = [c.first_byte for c in commands]
     assert places == sorted(set(places))
-    first = host_protocol(name).setpoint([1.0, 1.0], ATMOSPHERE, 0.25)[0][:1]
+    first = host_protocol(name).setpoint([1.0] * 4, ATMOSPHERE, 0.25)[0][:1]
     if name == "native":  # a frame begins after the zero that ends the one before
         assert all(stream[place - 1] == 0 for place in places)
     elif name == "festo":  # it begins with its number
@@ -152,7 +159,7 @@ def test_telemetry_arrives_as_it_was_measured(name, split):
 
 def test_a_native_board_refuses_more_than_it_reaches():
     host, board = host_protocol("native"), NativeBoard(4, 30_000)
-    (command,) = board.decode(host.setpoint([31_000.0, 0.0], 0.0, 0.25)[0])
+    (command,) = board.decode(host.setpoint([31_000.0, 0.0, 0.0, 0.0], 0.0, 0.25)[0])
     assert command.kind == "refused"
     (report,) = host.decode(board.reply(command, READING))
     assert report == BoardText("refused: pressure out of range")

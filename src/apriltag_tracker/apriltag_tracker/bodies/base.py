@@ -11,14 +11,13 @@ from apriltag_tracker.bodies.body_map import BaseFrame, BodyMap
 
 Array = NDArray[np.float64]
 
-_MEMORY = 300
-"""Frames over which fixed bodies are averaged."""
+_MEMORY = 50
+"""Frames over which fixed bodies are averaged, and after which the base follows if all of them were
+moved."""
 _ARM = 0.05
 """Distance of the points that stand for the axes of a body whose rotation is known [m]."""
 _MISFIT = 0.003
 """RMS distance at which fixed bodies do not fit together [m]."""
-_BUMP, _BUMP_FRAMES = 0.003, 3
-"""Way of the fixed bodies [m], and frames in a row, that mean that something was moved."""
 _LEAST_SPREAD = 0.005
 """Points that are nearer to a line than this tell no frame [m]."""
 _LEAST_MOTION = 0.003
@@ -61,22 +60,11 @@ class BaseFinder:
         axes = [np.eye(3) if body.rotation is None else body.rotation for body in bodies.fixed]
         places = np.array([body.position for body in bodies.fixed]).reshape(-1, 3)
         self._places = _arms(places, np.array(axes).reshape(-1, 3, 3))
-        self._fixed, self._bodies = bodies.frame, bodies
         self._mean, self._seen = np.zeros_like(self._places), np.zeros(len(self._index))
-        self._shifted = 0
-        self.frame = bodies.frame
+        self._given = self.frame = bodies.frame
         self.residual = math.nan
         """RMS distance of the fixed bodies from where the map has them [m]."""
-        self.bumps = 0
-        self.guessed = False
-        """Whether the frame is a guess from the limb's first shape."""
-        self.problem = ""
-        if bodies.frame is None:
-            self.problem = (
-                "no fixed body has been seen yet"
-                if self._index
-                else "the map has neither fixed bodies nor a frame, and the limb has not been seen"
-            )
+        self.problem = "" if bodies.frame else "no fixed body has been seen yet"
 
     def update(self, positions: Array, rotations: Array) -> BaseFrame | None:
         """Take one frame of all bodies and return the base to use for it, None without one.
@@ -85,25 +73,15 @@ class BaseFinder:
             positions: (n, 3) m, in the order of the map's names; NaN for what was not seen.
             rotations: (n, 3, 3) the bodies' axes, as columns.
         """
-        if self.frame is None and not self._index:
-            self._guess(positions)
         points = _arms(positions[self._index], rotations[self._index])
         seen = np.isfinite(points[:, 0, 0])
-        if self._fixed is not None or not seen.any():
+        if self._given is not None or not seen.any():
             return self.frame
-        known = seen & (self._seen > 0)
-        ways = np.linalg.norm(points[known, 0] - self._mean[known, 0], axis=1)
-        self._shifted = self._shifted + 1 if len(ways) and np.median(ways) > _BUMP else 0
-        if self._shifted >= _BUMP_FRAMES:
-            self.bumps += 1
-            self._shifted = 0
-            self._seen[:] = 0
         self._seen[seen] = np.minimum(self._seen[seen] + 1, _MEMORY)
         share = 1.0 / self._seen[seen, None, None]
         self._mean[seen] += share * (points[seen] - self._mean[seen])
         # The ends of the axes count where the map says how a body is turned.
-        used = (self._seen > 0)[:, None] & (np.arange(4) == 0)
-        used |= ((self._seen > 0) & self._turned)[:, None]
+        used = (self._seen > 0)[:, None] & (self._turned[:, None] | (np.arange(4) == 0))
         found = fit_frame(self._mean[used], self._places[used])
         self.frame = None
         if found is None:
@@ -119,21 +97,6 @@ class BaseFinder:
         else:
             (self.frame, self.residual), self.problem = found, ""
         return self.frame
-
-    def _guess(self, positions: Array) -> None:
-        """Take the frame from the limb's first shape, as if it were straight."""
-        limb = sorted(self._bodies.limb, key=lambda body: body.arc_length)
-        first, last = (positions[self._bodies.names.index(limb[k].name)] for k in (0, -1))
-        up = np.array(self._bodies.up)
-        along = last - first - up * (up @ (last - first))
-        length = np.linalg.norm(along)
-        if not length > _LEAST_SPREAD:
-            return
-        rotation = np.array([along / length, np.cross(up, along / length), up])
-        start = limb[0]
-        place = np.array([start.arc_length + start.offset[0], start.offset[1], start.height])
-        self.frame, self.guessed = BaseFrame(rotation, place - rotation @ first), True
-        self.problem = ""
 
 
 def _arms(positions: Array, rotations: Array) -> Array:

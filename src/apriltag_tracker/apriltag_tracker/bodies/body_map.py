@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from apriltag_tracker.tag_map import TagMapError, floats, limb_geometry, number, section
+from apriltag_tracker.tag_map import MapError, floats, limb_geometry, number, read_map, section
 
 SCHEMA_VERSION = 1
 LENGTH_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
@@ -23,10 +22,6 @@ AXES = {
 }
 """Directions that may be called up."""
 _KEYS = {"name", "place", "arc_length", "position", "height", "offset", "rotation"}
-
-
-class BodyMapError(ValueError):
-    """The body map is incomplete or impossible; the message names file, key and remedy."""
 
 
 @dataclass(frozen=True)
@@ -76,22 +71,12 @@ class BaseFrame:
         """Return points (n, 3) of the poses' frame [m] in `limb_base`."""
         return np.asarray(points @ self.rotation.T + self.translation, dtype=np.float64)
 
-    def moved(self, origin: NDArray[np.float64], axes: NDArray[np.float64]) -> BaseFrame:
-        """Return the frame whose origin and axes, as columns, are these in this one."""
-        return BaseFrame(axes.T @ self.rotation, axes.T @ (self.translation - origin))
-
-    def as_mapping(self) -> dict[str, list[float]]:
-        """Return it as the key `frame` of a body map."""
-        turn = Rotation.from_matrix(self.rotation.T).as_quat(canonical=True)
-        origin = -self.rotation.T @ self.translation
-        return {"position": origin.round(5).tolist(), "rotation": turn.round(6).tolist()}
-
     @classmethod
     def from_mapping(cls, entry: dict[str, Any]) -> BaseFrame:
         """Read where the origin and the axes of `limb_base` are in the frame of the poses, in m.
 
         Raises:
-            BodyMapError, TagMapError: a key is missing or impossible.
+            MapError: a key is missing or impossible.
         """
         origin = np.array(floats(entry.get("position"), 3, "frame: position"))
         rotation = _rotation(entry.get("rotation"), "frame").T
@@ -133,43 +118,41 @@ class BodyMap:
         """Read a body map.
 
         Raises:
-            BodyMapError: the file is missing, is no YAML, or a key is missing or impossible.
+            MapError: the file is missing, is no YAML, or a key is missing or impossible.
         """
-        try:
-            return cls.from_dict(yaml.safe_load(Path(path).read_text()))
-        except OSError as error:
-            raise BodyMapError(f"cannot read the body map {path}: {error.strerror}") from error
-        except yaml.YAMLError as error:
-            raise BodyMapError(f"the body map {path} is not YAML: {error}") from error
-        except (BodyMapError, TagMapError) as error:
-            raise BodyMapError(f"{path}: {error}") from error
+        return read_map(path, cls.from_dict)
 
     @classmethod
     def from_dict(cls, data: Any) -> BodyMap:
         """Build a body map from the content of its file.
 
         Raises:
-            BodyMapError, TagMapError: a key is missing or impossible.
+            MapError: a key is missing or impossible.
         """
         if not isinstance(data, dict) or data.get("schema") != SCHEMA_VERSION:
-            raise BodyMapError(f"'schema: {SCHEMA_VERSION}' expected at the top of a body map")
+            raise MapError(f"'schema: {SCHEMA_VERSION}' expected at the top of a body map")
         lengths, stiff = limb_geometry(section(data, "limb"))
         unit, up = str(data.get("length_unit", "m")), str(data.get("up", "z"))
         for key, value, choices in (("length_unit", unit, LENGTH_UNITS), ("up", up, AXES)):
             if value not in choices:
-                raise BodyMapError(f"{key} is '{value}': choose {', '.join(choices)}")
+                raise MapError(f"{key} is '{value}': choose {', '.join(choices)}")
         entries = data.get("bodies")
         if not isinstance(entries, list):
-            raise BodyMapError("bodies: a list of entries 'name: …, arc_length: …' expected")
+            raise MapError("bodies: a list of entries 'name: …, arc_length: …' expected")
         found = [_body(entry, sum(lengths)) for entry in entries]
         names = tuple(body.name for body in found)
         if twice := sorted({name for name in names if names.count(name) > 1}):
-            raise BodyMapError(f"bodies {', '.join(twice)} are listed twice: each has its own name")
+            raise MapError(f"bodies {', '.join(twice)} are listed twice: each has its own name")
         limb = tuple(body for body in found if isinstance(body, BodyOnLimb))
         if not limb:
-            raise BodyMapError("bodies: at least one must have an arc_length on the limb")
+            raise MapError("bodies: at least one must have an arc_length on the limb")
         fixed = tuple(body for body in found if isinstance(body, FixedBody))
-        frame = data.get("frame")
+        frame = BaseFrame.from_mapping(section(data, "frame")) if "frame" in data else None
+        if not fixed and frame is None:
+            raise MapError(
+                "bodies: at least one must have 'place: clamp' or 'place: world', or the key frame "
+                "must say where limb_base is"
+            )
         return cls(
             segment_lengths=lengths,
             limb=limb,
@@ -178,25 +161,25 @@ class BodyMap:
             stiff=stiff,
             unit=LENGTH_UNITS[unit],
             up=tuple(AXES[up].tolist()),
-            frame=None if frame is None else BaseFrame.from_mapping(section(data, "frame")),
+            frame=frame,
         )
 
 
 def _body(entry: Any, total: float) -> BodyOnLimb | FixedBody:
     if not isinstance(entry, dict) or not isinstance(entry.get("name"), str):
-        raise BodyMapError(f"bodies: an entry 'name: …, arc_length: …' expected, not {entry!r}")
+        raise MapError(f"bodies: an entry 'name: …, arc_length: …' expected, not {entry!r}")
     name = f"body {entry['name']}"
     if unknown := sorted(entry.keys() - _KEYS):
-        raise BodyMapError(f"{name}: unknown key '{unknown[0]}'; known: {', '.join(sorted(_KEYS))}")
+        raise MapError(f"{name}: unknown key '{unknown[0]}'; known: {', '.join(sorted(_KEYS))}")
     turn = _rotation(entry["rotation"], name) if "rotation" in entry else None
     if "arc_length" not in entry:
         if entry.get("place") not in ("clamp", "world"):
-            raise BodyMapError(f"{name}: an arc_length, or 'place: clamp' or 'place: world' needed")
+            raise MapError(f"{name}: an arc_length, or 'place: clamp' or 'place: world' needed")
         position = floats(entry.get("position"), 3, f"{name}: position")
         return FixedBody(entry["name"], np.array(position), turn)
     arc_length = number(entry["arc_length"], f"{name}: arc_length")
     if not 0.0 <= arc_length <= total:
-        raise BodyMapError(f"{name}: arc_length {arc_length} m is not on the limb (0 to {total} m)")
+        raise MapError(f"{name}: arc_length {arc_length} m is not on the limb (0 to {total} m)")
     along, across, angle = floats(entry.get("offset", [0.0, 0.0, 0.0]), 3, f"{name}: offset")
     height = number(entry.get("height", 0.0), f"{name}: height")
     rotation = np.eye(3) if turn is None else turn
@@ -206,5 +189,5 @@ def _body(entry: Any, total: float) -> BodyOnLimb | FixedBody:
 def _rotation(value: Any, name: str) -> NDArray[np.float64]:
     quaternion = np.array(floats(value, 4, f"{name}: rotation"))
     if not 0.99 < float(np.linalg.norm(quaternion)) < 1.01:
-        raise BodyMapError(f"{name}: rotation {value} is no quaternion x, y, z, w of length 1")
+        raise MapError(f"{name}: rotation {value} is no quaternion x, y, z, w of length 1")
     return np.asarray(Rotation.from_quat(quaternion).as_matrix(), dtype=np.float64)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import json
 import sys
 import time
 from typing import Any
@@ -102,11 +101,8 @@ class PoseTrackerNode(LimbStateNode):
             "bodies_misplaced": tracker.follower.misplaced,
             "bodies_swapped": tracker.swapped,
             "base_residual_mm": f"{1e3 * tracker.base.residual:.2f}",
-            "base_bumps": tracker.base.bumps,
             **tracker.plane.values(),
         }
-        if tracker.base.frame is not None:
-            values["frame"] = json.dumps(tracker.base.frame.as_mapping())
         if silence := self._watch.silence():
             others = f"; other bodies came: {', '.join(unknown)}" if unknown else ""
             why = "are its poses of the bodies of the body map?"
@@ -116,12 +112,6 @@ class PoseTrackerNode(LimbStateNode):
             return Health(self._watch.silence_level, said, values)
         if error := tracker.base.problem or self._problem:
             return Health("error", error, values)
-        if tracker.base.bumps:
-            said = f"fixed bodies were moved {tracker.base.bumps} time(s); the base was found again"
-            return Health("warning", said, values)
-        if tracker.base.guessed:
-            said = "limb_base is a guess from the first shape: scripts/check_rig.py finds it"
-            return Health("warning", said, values)
         if self._reason:
             return Health("warning", self._reason, values)
         return Health("ok", "tracking", values)

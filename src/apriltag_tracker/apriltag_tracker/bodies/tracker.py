@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import bisect
-import math
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +14,12 @@ from scipy.spatial.transform import Rotation
 
 from apriltag_tracker.bodies.base import BaseFinder, PlaneWatch
 from apriltag_tracker.bodies.body_map import BodyMap
-from apriltag_tracker.pose.following import Followed, FollowerOptions, LimbFollower
+from apriltag_tracker.pose.following import (
+    Followed,
+    FollowerOptions,
+    LimbFollower,
+    survey_errors,
+)
 from apriltag_tracker.pose.shape import CURVE_POINTS, PlanarTag, centreline_pose
 
 Array = NDArray[np.float64]
@@ -141,6 +146,9 @@ class BodyTracker:
         noise = noise or BodyNoise()
         self._covariance = np.diag([noise.position, noise.position, noise.direction]) ** 2
         self.base = BaseFinder(bodies)
+        fixed = np.array([body.position[:2] for body in bodies.fixed] or [np.zeros(2)])
+        survey, least = self._options.uncertainty.survey, 0.01 if len(fixed) > 1 else bodies.length
+        self._shared = partial(survey_errors, fixed=fixed, survey=survey, least_spread=least)
         self.plane = PlaneWatch(np.array([body.height for body in bodies.limb]))
         names = {place: body.name for place, body in enumerate(bodies.limb)}
         self.follower = LimbFollower(bodies, names, self._options, "body", "in the poses")
@@ -186,7 +194,7 @@ class BodyTracker:
             )
             for k in seen
         ]
-        followed = self.follower.follow(planar, stamp, self._common_errors(places[seen]))
+        followed = self.follower.follow(planar, stamp, self._shared(places[seen]))
         wrong = np.flatnonzero(order != np.arange(len(order)))
         if len(wrong):
             self.swapped += 1
@@ -231,18 +239,3 @@ class BodyTracker:
         if distances[rows, columns].sum() < _SWAP_GAIN * np.trace(distances):
             own[seen[rows]] = seen[columns]
         return own
-
-    def _common_errors(self, places: Array) -> Array:
-        """Return how bodies move with the survey's shift in x and y and its turn, (n, 3, 3)."""
-        survey, fixed = self._options.uncertainty.survey, self.bodies.fixed
-        spread = self.bodies.length
-        if len(fixed) > 1:
-            positions = np.array([body.position[:2] for body in fixed])
-            spread = float(np.sqrt(np.sum((positions - positions.mean(axis=0)) ** 2)))
-        shift = survey / math.sqrt(max(len(fixed), 1))
-        turn = survey / max(spread, 0.01)
-        moves = np.zeros((len(places), 3, 3))
-        moves[:, 0, 0] = moves[:, 1, 1] = shift
-        moves[:, 0, 2], moves[:, 1, 2] = -turn * places[:, 1], turn * places[:, 0]
-        moves[:, 2, 2] = turn
-        return moves

@@ -40,7 +40,7 @@ from apriltag_tracker.camera.calibration import (
 )
 from apriltag_tracker.camera.images import PICTURES, ImageError, to_grey
 from apriltag_tracker.sheets import SheetError, add_board_arguments, given_board
-from apriltag_tracker.tag_map import TagMap, TagMapError
+from apriltag_tracker.tag_map import MapError, TagMap
 from limb_interfaces import qos
 
 DEFAULT_MAP = Path(get_package_share_directory("apriltag_tracker")) / "config" / "tags.yaml"
@@ -224,7 +224,7 @@ def main() -> int:
     try:
         _check_output(options.out)
         (intrinsics if options.what == "intrinsics" else mounting)(options)
-    except (CalibrationError, CameraError, ImageError, SheetError, TagMapError, OSError) as error:
+    except (CalibrationError, CameraError, ImageError, SheetError, MapError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     return 0

@@ -24,7 +24,7 @@ from apriltag_tracker.sheets import (
     write_pdf,
     write_svg,
 )
-from apriltag_tracker.tag_map import TagMap, TagMapError
+from apriltag_tracker.tag_map import MapError, TagMap
 
 DEFAULT_MAP = Path(get_package_share_directory("apriltag_tracker")) / "config" / "tags.yaml"
 
@@ -66,7 +66,7 @@ def main() -> int:
             _write(tag_pages(tag_map, options.paper), "tags", options)
         else:
             _write([board_page(given_board(options), options.paper)], "board", options)
-    except (TagMapError, SheetError, OSError) as error:
+    except (MapError, SheetError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     print("Print at 100 % (no 'fit to page') and check the 100 mm line with a ruler.")

@@ -72,6 +72,30 @@ class Followed(NamedTuple):
     bridged: bool = False
 
 
+def survey_errors(
+    places: NDArray[np.float64], fixed: NDArray[np.float64], survey: float, least_spread: float
+) -> NDArray[np.float64]:
+    """Return how what is on the limb moves with errors of the survey that all of it shares.
+
+    Args:
+        places: (n, 3) x, y [m], heading [rad] on the limb.
+        fixed: (k, 2) of what was surveyed [m].
+        survey: standard deviation of one of its positions [m].
+        least_spread: of ``fixed`` about its middle, which tells the turn [m].
+
+    Returns:
+        (n, 3, 3): by a shift in x, in y, and a turn, of one standard deviation each.
+    """
+    middle = fixed.mean(axis=0)
+    spread = max(float(np.sqrt(np.sum((fixed - middle) ** 2))), least_spread)
+    shift, turn = survey / np.sqrt(len(fixed)), survey / spread
+    moves = np.zeros((len(places), 3, 3))
+    moves[:, 0, 0] = moves[:, 1, 1] = shift
+    moves[:, :2, 2] = turn * (places[:, :2] - middle)[:, ::-1] * [-1.0, 1.0]
+    moves[:, 2, 2] = turn
+    return moves
+
+
 class LimbFollower:
     """Fits the limb to what is seen of it, picture after picture.
 

@@ -10,7 +10,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 from ament_index_python.packages import get_package_share_directory
-from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, Image
 
 from apriltag_tracker.synthetic.camera import (
@@ -19,11 +18,10 @@ from apriltag_tracker.synthetic.camera import (
     Optics,
     SyntheticCamera,
 )
+from apriltag_tracker.synthetic.nodes.listening import ShapeListener
 from apriltag_tracker.synthetic.shapes import Shape, constant_curvature
 from apriltag_tracker.tag_map import TagMap
-from der_msgs.msg import LimbShape
 from limb_interfaces import qos, stamps, topics
-from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
 from limb_interfaces.parameters import check_overrides, declare
 from limb_interfaces.runner import run_node
 
@@ -31,11 +29,11 @@ FRAME = "camera_optical_frame"
 _INFO_PERIOD = 0.5
 
 
-class SyntheticCameraNode(Node):
+class SyntheticCameraNode(ShapeListener):
     """Subscribes to the twin's shape, publishes images with the shape's stamp, and camera_info."""
 
     def __init__(self) -> None:
-        super().__init__("synthetic_camera", namespace=topics.NAMESPACE)
+        super().__init__("synthetic_camera")
         cv2.setNumThreads(1)
         share = Path(get_package_share_directory("apriltag_tracker")) / "config"
         tag_map = declare(
@@ -48,7 +46,7 @@ class SyntheticCameraNode(Node):
             "YAML file: lens and place of the rendered camera",
         )
         seed = declare(self, "seed", 0, "of noise, floor and set-up errors", at_least=0)
-        number = self._number
+        number = self.number
         optics = Optics(
             noise=number("noise", Optics.noise, "noise of a pixel, grey levels", 30.0),
             blur=number("blur", Optics.blur, "blur of the lens, standard deviation in px", 4.0),
@@ -70,10 +68,6 @@ class SyntheticCameraNode(Node):
         straight = constant_curvature(tags.segment_lengths, [0.0] * len(tags.segment_lengths))
         self._camera.frame(straight, straight)
         self._before: tuple[int, Shape] | None = None
-        self._frames = 0
-        self._refused = 0
-        self._last_shape = time.monotonic()
-        self._busy = 0.0
         self._image = self._image_message()
         size = self._camera.model.intrinsics
         self._pixels = np.frombuffer(self._image.data, np.uint8).reshape(size.height, size.width)
@@ -83,14 +77,8 @@ class SyntheticCameraNode(Node):
         self._images = self.create_publisher(Image, topics.IMAGE, qos.SENSOR_DATA)
         self._infos = self.create_publisher(CameraInfo, topics.CAMERA_INFO, qos.LATCHED)
         self._last_info = 0.0
-        self.create_subscription(LimbShape, topics.TWIN_SHAPE, self._on_shape, qos.IMAGES)
-        self._diagnostics = DiagnosticsPublisher(self, self._health, "rendered")
+        self.listen("rendered", qos.IMAGES)
         self._publish_info()
-
-    def _number(self, name: str, default: float, description: str, at_most: float) -> float:
-        return float(
-            declare(self, name, float(default), description, at_least=0.0, at_most=at_most)
-        )
 
     def _image_message(self) -> Image:
         size = self._camera.model.intrinsics
@@ -118,29 +106,16 @@ class SyntheticCameraNode(Node):
         self._last_info = time.monotonic()
         self._infos.publish(self._info)
 
-    def _on_shape(self, message: LimbShape) -> None:
-        started = time.perf_counter()
-        self._last_shape = time.monotonic()
-        count = len(message.points)
-        if count < 2 or not count == len(message.arc_length) == len(message.heading):
-            self._refused += 1
-            return
-        points = np.array([(point.x, point.y) for point in message.points])
-        shape = Shape(np.array(message.arc_length), points, np.array(message.heading))
-        if not (np.isfinite(points).all() and np.all(np.diff(shape.arc_length) > 0.0)):
-            self._refused += 1
-            return
-        stamp = stamps.nanoseconds(message.header.stamp)
+    def show(self, stamp: int, shape: Shape) -> None:
+        """Render the shape."""
         # Into the message itself, where everything but the limb has been drawn meanwhile.
         self._camera.frame(shape, self._velocity(stamp, shape))
-        self._image.header.stamp = message.header.stamp
+        self._image.header.stamp = stamps.stamp_from_nanoseconds(stamp)
         self._images.publish(self._image)
         self._before = (stamp, shape)
         if time.monotonic() - self._last_info > _INFO_PERIOD:
-            self._info.header.stamp = message.header.stamp
+            self._info.header.stamp = self._image.header.stamp
             self._publish_info()
-        self._frames += 1
-        self._busy += time.perf_counter() - started
         self._camera.prepare(self._pixels)
 
     def _velocity(self, stamp: int, shape: Shape) -> Shape | None:
@@ -156,25 +131,6 @@ class SyntheticCameraNode(Node):
             (shape.points - before.points) / elapsed,
             (shape.heading - before.heading) / elapsed,
         )
-
-    def _health(self) -> Health:
-        silent = time.monotonic() - self._last_shape
-        values = {
-            "frames": self._frames,
-            "refused_shapes": self._refused,
-            "render_ms": f"{1e3 * self._busy / max(self._frames, 1):.2f}",
-        }
-        if self._frames == 0:
-            return Health("stale", f"waiting for shapes on {topics.TWIN_SHAPE}", values)
-        if silent > 1.0:
-            return Health(
-                "warning",
-                f"no shape on {topics.TWIN_SHAPE} for {silent:.0f} s: is limb_twin running?",
-                values,
-            )
-        if self._refused:
-            return Health("warning", f"{self._refused} malformed shapes were left out", values)
-        return Health("ok", "rendering", values)
 
 
 def main() -> int:

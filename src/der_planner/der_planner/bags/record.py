@@ -120,7 +120,7 @@ class LimbRecord:
         commanded, measured: differential pressures [Pa].
         faults: reasons of the driver with their stamps [ns].
         touches: by plan id and when one began [ns]: how far it was from a free limb, what it said.
-        board: commands as the board received them [Pa] (twin only).
+        board: pressures of the valves (2M,) as the board received them [Pa] (twin only).
         ahead: by which a state or pressure is stamped later than it arrived, at the most [ns].
     """
 
@@ -196,8 +196,7 @@ class LimbRecord:
 
     def add_board(self, message: Any) -> None:
         """Add the `ChamberPressures` of a command that the twin's board received."""
-        chambers = np.asarray(message.pressure)
-        self.board.append(header_stamp(message), chambers[0::2] - chambers[1::2])
+        self.board.append(header_stamp(message), message.pressure)
 
 
 @dataclass(frozen=True)

@@ -16,14 +16,16 @@ import argparse
 import sys
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
 
-from apriltag_tracker.bodies.body_map import BaseFrame, BodyMap, BodyMapError
+from apriltag_tracker.bodies.body_map import BodyMap
 from apriltag_tracker.pose.clamp import Clamp, find_clamp
-from apriltag_tracker.tag_map import LimbTag, TagMap, TagMapError
+from apriltag_tracker.tag_map import LimbTag, MapError, TagMap
 from der_planner.bags.reader import BagError, BagReader
 from der_planner.bags.record import PRESSURE_TYPE, Columns, header_stamp
 from der_planner.experiment.console import (
@@ -42,8 +44,8 @@ from der_planner.limb import Limb
 from der_planner.twin import TwinError
 from der_planner.twin.wiring import Wiring
 from limb_interfaces import topics
-from pressure_driver.hoses import HoseError, Hoses
-from pressure_driver.settings import Settings
+from pressure_driver.following import valves_of
+from pressure_driver.settings import SettingError, Settings
 
 TAGS_TYPE = "der_msgs/msg/TagDetectionArray"
 CLAMP_OFF = (0.002, 0.002, float(np.deg2rad(1.5)))
@@ -55,7 +57,7 @@ SEEN_TOGETHER = 10
 def main() -> int:
     """Run the command line."""
     given = _parser().parse_args()
-    errors = (RigError, BagError, BodyMapError, TagMapError, TwinError, GraphError, NodeError)
+    errors = (RigError, BagError, MapError, TwinError, GraphError, NodeError)
     return run_command(lambda: _main(given), *errors, OSError, stopped="no rig file was written")
 
 
@@ -95,24 +97,13 @@ def _main(given: argparse.Namespace) -> int:
     lines = finding.lines()
     offsets = [body.offset for body in bodies.limb]
     clamp = find_clamp(bodies, log.arc_lengths, offsets, log.places)
-    told = _tracker_values(bag) if isinstance(bodies, BodyMap) else {}
-    if "plane_tilt_deg" in told:
-        lines.append(
-            f"plane of motion: tilted by {told['plane_tilt_deg']}° toward "
-            f"{told['plane_tilt_toward_deg']}°, bodies leave it by {told['out_of_plane_mm_rms']} mm"
-        )
-    frame = None
     if clamp is not None and not finding.contradictions:
         lines += clamp_lines(clamp)
-        if isinstance(bodies, BodyMap) and not bodies.fixed and "frame" in told:
-            height = float(np.mean([body.height for body in bodies.limb]))
-            frame = found_frame(clamp, told, height)
-            lines.append("limb_base: found from the limb, for a map without fixed bodies")
+    lines += _plane_line(bag)
     print("\n".join(lines))
-    before = hardware.driver.get("wiring", "") if hardware else ""
     try:
-        wiring = played_wiring(finding, str(before))
-    except (HoseError, RigError) as error:
+        wiring = played_wiring(finding, hardware.driver if hardware else {})
+    except (SettingError, RigError) as error:
         print(f"no file is written: {error}", file=sys.stderr)
         return 3
     if given.out is not None:
@@ -120,50 +111,24 @@ def _main(given: argparse.Namespace) -> int:
         content["driver"] = {**content.get("driver", {}), "wiring": wiring}
         content["found"] = lines
         given.out.parent.mkdir(parents=True, exist_ok=True)
-        if frame is not None and hardware is not None and hardware.poses is not None:
-            mapped = yaml.safe_load(Path(hardware.poses["body_map"]).read_text())
-            path = given.out.with_name(f"{given.out.stem}_bodies.yaml").resolve()
-            path.write_text(yaml.safe_dump(mapped | {"frame": frame}, sort_keys=False))
-            content["poses"] = {**hardware.poses, "body_map": str(path)}
-            print(f"body map: {path}")
         given.out.write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True))
         print(f"rig file: {given.out}")
     return 0
 
 
-def found_frame(clamp: Clamp, told: Mapping[str, str], height: float) -> dict[str, list[float]]:
-    """Return the key `frame` of a body map: at the clamp, with z across the plane of motion.
-
-    Args:
-        clamp: found in the frame that the tracker of bodies had.
-        told: its diagnostics: that frame, and the plane's tilt.
-        height: of the bodies [m].
-    """
-    tilt, toward = (
-        float(np.radians(float(told.get(key, 0.0))))
-        for key in ("plane_tilt_deg", "plane_tilt_toward_deg")
-    )
-    x, y, heading = clamp.place
-    up = np.array([np.sin(tilt) * np.cos(toward), np.sin(tilt) * np.sin(toward), np.cos(tilt)])
-    along = np.array([np.cos(heading), np.sin(heading), 0.0])
-    along -= up * (up @ along)
-    along /= np.linalg.norm(along)
-    axes = np.column_stack([along, np.cross(up, along), up])
-    before = BaseFrame.from_mapping(yaml.safe_load(told["frame"]))
-    # The clamp was seen in the bodies' plane, which is that far above the centreline's.
-    origin = np.array([x, y, 0.0]) + height * (np.array([0.0, 0.0, 1.0]) - up)
-    return before.moved(origin, axes).as_mapping()
-
-
-def _tracker_values(bag: Path) -> dict[str, str]:
-    """Return the last diagnostics of the tracker of bodies."""
-    found: dict[str, str] = {}
+def _plane_line(bag: Path) -> list[str]:
+    """Return what the tracker of bodies has found of the plane of motion, if it has."""
+    told: dict[str, str] = {}
     with BagReader(bag) as reader:
         for _, _, message in reader.messages([topics.DIAGNOSTICS]):
             for status in message.status:
-                if status.name.endswith("pose_tracker"):
-                    found = {entry.key: entry.value for entry in status.values}
-    return found
+                told.update({entry.key: entry.value for entry in status.values})
+    if "plane_tilt_deg" not in told:
+        return []
+    return [
+        f"plane of motion: tilted by {told['plane_tilt_deg']}° toward "
+        f"{told['plane_tilt_toward_deg']}°, bodies leave it by {told['out_of_plane_mm_rms']} mm"
+    ]
 
 
 def clamp_lines(clamp: Clamp) -> list[str]:
@@ -211,23 +176,21 @@ def _bodies(given: argparse.Namespace, hardware: Hardware | None) -> TagMap | Bo
     return TagMap.from_yaml(tracker.get("tag_map", share / "tags.yaml"))
 
 
-def played_wiring(finding: RigFinding, before: str) -> str:
+def played_wiring(finding: RigFinding, driver: Mapping[str, Any]) -> str:
     """Return the driver's parameter ``wiring`` for what was found.
 
     Args:
-        finding: of a check that was played with the driver's present wiring.
-        before: that wiring; empty: each chamber its own valve.
+        finding: of a check.
+        driver: parameters of the driver in it.
 
     Raises:
-        HoseError: the driver cannot play it; says which hoses to swap.
+        SettingError: the board cannot play it; says what to do.
         RigError: the rig contradicts itself.
     """
-    chambers = finding.wiring
-    valves = [int(word) for word in before.replace(",", " ").split()]
-    valves = valves or list(range(1, len(chambers) + 1))
-    found = ",".join(str(valves[channel]) for channel in chambers)
-    Hoses(found, len(chambers) // 2)
-    return found
+    present = Settings(**driver)
+    valves = valves_of(present.wiring, len(finding.valves))
+    found = ",".join(str(valves[channel] + 1) for channel in finding.wiring)
+    return replace(present, wiring=found).wiring
 
 
 def read_check(path: Path, bodies: TagMap | BodyMap) -> RigLog:

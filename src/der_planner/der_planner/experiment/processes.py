@@ -187,9 +187,10 @@ class GraphSetup:
         board = {"port_link": port, "seed": self.seed, **language}
         twin = {"seed": self.seed, "run": self.run, **_twin_loads(self.limb)}
         driver = {"port": port, **(language if self.hardware is None else {}), **rig.driver}
+        wired = {"wiring": driver["wiring"]} if driver.get("wiring") else {}
         recorder = {
             "output": str(self.bag),
-            "metadata": json.dumps(self.metadata),
+            "metadata": json.dumps(self.metadata | wired),
             "record_images": self.record_images,
             **rig.recorder,
         }

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import codecs
 import csv
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import dropwhile
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +15,13 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
-from apriltag_tracker.bodies.body_map import BodyMap, BodyMapError
+from apriltag_tracker.bodies.body_map import BodyMap
 from apriltag_tracker.bodies.tracker import BodyTracker, PoseFrame
+from apriltag_tracker.tag_map import MapError
 from der_planner.arrays import Array
 from der_planner.bags.reader import BagError, BagReader
-from der_planner.bags.record import header_stamp
+from der_planner.bags.record import Columns, header_stamp
+from der_planner.bags.series import stream
 from der_planner.identification.log import LogError, on_grid
 from der_planner.model import CONTROL_PERIOD
 
@@ -57,11 +62,8 @@ def read_poses(path: Path) -> PoseLog:
     Raises:
         LogError: it is neither, or holds no rigid bodies with rotations; says how to export them.
     """
-    try:
-        lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
-    except OSError as error:
-        raise LogError(f"cannot read the poses {path}: {error.strerror}") from error
-    start = lines[0] if lines else ""
+    lines = lines_of(path)
+    start = lines[0]
     try:
         if start.startswith(_MOTIVE):
             return _motive(path, lines)
@@ -73,6 +75,25 @@ def read_poses(path: Path) -> PoseLog:
         f"{path} is no table of motion capture that is known: export it from Motive as CSV, or "
         "from QTM as TSV of 6DOF data, each with its header"
     )
+
+
+def lines_of(path: Path) -> list[str]:
+    """Return the lines that hold something; the first is the header."""
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise LogError(f"cannot read the log {path}: {error.strerror}") from error
+    wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    try:
+        text = content.decode("utf-16" if wide else "utf-8-sig")
+    except UnicodeDecodeError:
+        # Names of columns may hold a degree sign of an older program.
+        text = content.decode("cp1252", errors="replace")
+    written = (line for line in text.splitlines() if line.strip())
+    lines = list(dropwhile(lambda line: line.lstrip().startswith("#"), written))
+    if not lines:
+        raise LogError(f"the log {path} is empty")
+    return lines
 
 
 def _motive(path: Path, lines: Sequence[str]) -> PoseLog:
@@ -136,7 +157,7 @@ def bends_of(log: PoseLog, body_map: Path, time: Array) -> tuple[Array, Array]:
     """
     try:
         bodies = BodyMap.from_yaml(body_map)
-    except BodyMapError as error:
+    except MapError as error:
         raise LogError(str(error)) from error
     missing = [name for name in bodies.names if name not in log.names]
     if missing:
@@ -170,29 +191,28 @@ def read_bag_table(path: Path) -> dict[str, Array]:
     Raises:
         LogError: the bag cannot be read, or holds none of these.
     """
-    found: dict[str, dict[float, float]] = {}
+    found: defaultdict[str, Columns] = defaultdict(Columns)
     try:
         with BagReader(path) as bag:
             for topic, logged, message in bag.messages(list(bag.topics)):
-                header = getattr(message, "header", None)
-                stamp = header_stamp(message) if header is not None else 0
+                stamp = header_stamp(message) if hasattr(message, "header") else 0
                 for name, value in _values(topic, message).items():
-                    found.setdefault(name, {})[1e-9 * (stamp or logged)] = value
+                    found[name].append(stamp or logged, (value,))
     except BagError as error:
         raise LogError(str(error)) from error
-    found = {name: dict(sorted(kept.items())) for name, kept in found.items() if len(kept) > 1}
-    if not found:
+    known = {name: rows for name, rows in found.items() if len(rows) > 1}
+    if not known:
         raise LogError(f"the bag {path} holds no joint states, arrays or fluid pressures")
-    start = max(min(kept) for kept in found.values())
-    end = min(max(kept) for kept in found.values())
-    if end - start < 1.0:
+    origin = max(int(rows.stamps().min()) for rows in known.values())
+    streams = {name: stream(rows, 1, origin) for name, rows in known.items()}
+    end = min(each.time[-1] for each in streams.values())
+    if end < 1.0:
         raise LogError(f"the topics of {path} do not overlap: do their clocks agree?")
-    grid = np.arange(start, end, CONTROL_PERIOD)
-    table = {"time": grid - start}
-    for name, kept in found.items():
-        column = np.array(list(kept.values()))[:, None]
-        table[name] = on_grid(np.array(list(kept)), column, grid, LONGEST_SILENCE)[:, 0]
-    return table
+    grid = np.arange(0.0, end, CONTROL_PERIOD)
+    return {"time": grid} | {
+        name: on_grid(each.time, each.value, grid, LONGEST_SILENCE)[:, 0]
+        for name, each in streams.items()
+    }
 
 
 def _values(topic: str, message: Any) -> dict[str, float]:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import codecs
 import csv
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
-from itertools import dropwhile
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +21,7 @@ from der_planner.identification.foreign import (
     LONGEST_SILENCE,
     bends_of,
     is_bag,
+    lines_of,
     read_bag_table,
     read_poses,
 )
@@ -322,7 +321,7 @@ def read_table(path: Path) -> dict[str, Array]:
         LogError: the file cannot be read, names a column twice, has fewer than two rows or another
             number of columns in a row, or holds something that is no number; names row and column.
     """
-    header_line, *lines = _lines(path)
+    header_line, *lines = lines_of(path)
     separator = next((mark for mark in SEPARATORS if mark in header_line), ",")
     header = [name.strip() for name in next(csv.reader([header_line], delimiter=separator))]
     twice = [name for name in header if name and header.count(name) > 1]
@@ -346,25 +345,6 @@ def read_table(path: Path) -> dict[str, Array]:
             f"the rows of {path} have {values.shape[1]} columns, its header has {len(header)}"
         )
     return dict(zip(header, values.T, strict=True))
-
-
-def _lines(path: Path) -> list[str]:
-    """Return the lines that hold something; the first is the header."""
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise LogError(f"cannot read the log {path}: {error.strerror}") from error
-    wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
-    try:
-        text = content.decode("utf-16" if wide else "utf-8-sig")
-    except UnicodeDecodeError:
-        # Names of columns may hold a degree sign of an older program.
-        text = content.decode("cp1252", errors="replace")
-    written = (line for line in text.splitlines() if line.strip())
-    lines = list(dropwhile(lambda line: line.lstrip().startswith("#"), written))
-    if not lines:
-        raise LogError(f"the log {path} is empty")
-    return lines
 
 
 def _number(cell: str) -> float:

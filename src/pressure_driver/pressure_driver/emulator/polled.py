@@ -1,4 +1,4 @@
-"""Boards that speak when they are spoken to: a Festo terminal and PneuDrive boards."""
+"""Boards that speak when they are spoken to: a Festo terminal and a PneuDrive board."""
 
 from __future__ import annotations
 
@@ -128,14 +128,6 @@ class FestoBoard(BoardProtocol):
             for chamber, value in enumerate(pressure)
         ]
 
-    def _registers(self, first: int, count: int, reading: BoardReading) -> list[int]:
-        """Return what registers hold, or nothing if there are none of these numbers."""
-        held = ((FIRST_OUTPUT, self._outputs), (FIRST_INPUT, self._inputs(reading)))
-        for begin, registers in held:
-            if begin <= first and first + count <= begin + len(registers):
-                return registers[first - begin : first - begin + count]
-        return []
-
     def _inputs(self, reading: BoardReading) -> list[int]:
         measured = [
             round((pressure - reading.atmosphere) / PASCAL_PER_MILLIBAR)
@@ -157,9 +149,10 @@ class FestoBoard(BoardProtocol):
             return modbus.encode(number, first | modbus.FAILED, bytes([second]))
         if command.kind == "setpoint":
             return modbus.encode(number, modbus.WRITE, modbus.BLOCK.pack(first, second))
-        data = modbus.to_bytes(self._registers(first, second, reading))
-        if not data:
+        words, offset = self._inputs(reading), first - FIRST_INPUT
+        if not 0 <= offset <= len(words) - second:
             return modbus.encode(number, modbus.READ | modbus.FAILED, bytes([ILLEGAL_ADDRESS]))
+        data = modbus.to_bytes(words[offset : offset + second])
         return modbus.encode(number, modbus.READ, bytes([len(data)]) + data)
 
     def expired(self) -> bytes:
@@ -168,47 +161,28 @@ class FestoBoard(BoardProtocol):
 
 
 class PneudriveBoard(BoardProtocol):
-    """The boards' end of ``pneudrive``: all those on the bus."""
+    """The board's end of ``pneudrive``."""
 
     gauge = True
 
     def __init__(self, chamber_count: int = 4) -> None:
         super().__init__(chamber_count)
-        self._frames = pneudrive.TargetReader()
-        self._range = pneudrive.NOMINAL_RANGE
-        self._counts = [0] * chamber_count
+        self._frames = pneudrive.Frames(chamber_count)
 
     def configure(self, settings: EmulatorSettings) -> None:
         """Take over the range of the sensors."""
-        self._range = settings.sensor_range
+        self._frames.sensor_range = settings.sensor_range
 
     def decode(self, data: bytes) -> list[BoardCommand]:
-        """Return targets, those that other boards were told before with them."""
-        before = self._frames.rejected
-        commands = []
-        for place, board, counts in self._frames.feed(data):
-            first = pneudrive.VALVES * board
-            if first >= self.chamber_count:
-                self.rejected += 1  # nobody has this address
-                continue
-            used = min(pneudrive.VALVES, self.chamber_count - first)
-            self._counts[first : first + used] = counts[:used]
-            pressure = tuple(pneudrive.gauge_of(count, self._range) for count in self._counts)
-            commands.append(BoardCommand("setpoint", place, pressure=pressure, text=str(board)))
-        self.rejected += self._frames.rejected - before
-        return commands
+        """Return targets."""
+        frames = self._frames.feed(data)
+        self.rejected = self._frames.rejected
+        return [BoardCommand("setpoint", place, pressure=gauge) for place, gauge in frames]
 
     def target(self, pressure: Sequence[float], time: float) -> Sequence[float]:
-        """Return the targets; nothing while the boards start."""
+        """Return the targets; nothing while the board starts."""
         return pressure if time >= PNEUDRIVE_BOOT_TIME else [0.0] * len(pressure)
 
-    def reply(self, command: BoardCommand, reading: BoardReading) -> bytes:
+    def reply(self, command: BoardCommand, reading: BoardReading) -> bytes:  # noqa: ARG002
         """What the board measures, in the layout of its targets."""
-        board = int(command.text)
-        first = pneudrive.VALVES * board
-        counts = [
-            max(pneudrive.counts_of(pressure - reading.atmosphere, self._range), 0)
-            for pressure in reading.chamber_pressure[first : first + pneudrive.VALVES]
-        ]
-        counts += [0] * (pneudrive.VALVES - len(counts))
-        return pneudrive.FRAME.pack(0xFFFF - board, *counts)
+        return self._frames.encode([p - reading.atmosphere for p in reading.chamber_pressure])

@@ -224,12 +224,12 @@ class HostProtocol(ABC):
 
     @abstractmethod
     def setpoint(
-        self, differential: Sequence[float], atmosphere: float, valid_for: float
+        self, gauge: Sequence[float], atmosphere: float, valid_for: float
     ) -> tuple[bytes, int | None]:
         """Encode one command.
 
         Args:
-            differential: (M,) [Pa] within the driver's limits; positive fills the even chamber.
+            gauge: (2M,) [Pa] of each valve, within the driver's limits.
             atmosphere: [Pa] absolute, to add where the wire wants absolute pressures.
             valid_for: [s] after which a board with a watchdog vents by itself.
 
@@ -239,15 +239,14 @@ class HostProtocol(ABC):
 
     def vent(self, atmosphere: float) -> tuple[bytes, int | None]:
         """Encode the command that opens every chamber to the atmosphere, or regulates to it."""
-        return self.setpoint([0.0] * (self.chamber_count // 2), atmosphere, 0.0)
+        return self.setpoint([0.0] * self.chamber_count, atmosphere, 0.0)
 
-    def emergency(self, atmosphere: float) -> list[bytes]:
+    def emergency(self, atmosphere: float) -> bytes:
         """Return what empties a board in any state, for a process that knows nothing about it.
 
-        Each is complete after any half-sent bytes. A board on a bus must have answered one before
-        the next is sent.
+        It is complete after any half-sent bytes.
         """
-        return [self.separator + self.vent(atmosphere)[0]]
+        return self.separator + self.vent(atmosphere)[0]
 
     def follow_up(self) -> bytes:
         """Return what is to be sent at once because of what has been decoded."""

@@ -84,16 +84,12 @@ class CtrlpHost(LineHost):
 
     def setpoint(
         self,
-        differential: Sequence[float],
+        gauge: Sequence[float],
         atmosphere: float,  # noqa: ARG002 - the wire carries gauge pressures
         valid_for: float,  # noqa: ARG002 - the board has no watchdog
     ) -> tuple[bytes, int | None]:
         """Encode one gauge pressure a channel in kPa, to 1 Pa."""
-        values: list[float] = []
-        for difference in differential:
-            size = abs(difference) / PASCAL_PER_KILOPASCAL
-            values += [size, 0.0] if difference >= 0.0 else [0.0, size]
-        numbers = ";".join(f"{value:.3f}" for value in values)
+        numbers = ";".join(f"{value / PASCAL_PER_KILOPASCAL:.3f}" for value in gauge)
         return f"SET;{RAMP_TIME:.3f};{numbers}\n".encode(), None
 
     def vent(self, atmosphere: float) -> tuple[bytes, int | None]:  # noqa: ARG002

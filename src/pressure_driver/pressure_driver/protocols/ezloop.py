@@ -68,7 +68,7 @@ class EzloopHost(LineHost):
 
     def setpoint(
         self,
-        differential: Sequence[float],
+        gauge: Sequence[float],
         atmosphere: float,
         valid_for: float,  # noqa: ARG002 - the board has no watchdog
     ) -> tuple[bytes, int | None]:
@@ -77,17 +77,12 @@ class EzloopHost(LineHost):
         A pair that would pass 1250 hPa is sent lower as a pair: the board only reads differences.
         """
         values: list[float] = []
-        for difference in differential:
-            size = abs(difference) / PASCAL_PER_HECTOPASCAL
-            low = min(atmosphere / PASCAL_PER_HECTOPASCAL, LARGEST_WIRE_VALUE - size)
+        for pair in zip(gauge[0::2], gauge[1::2], strict=True):
+            sizes = [value / PASCAL_PER_HECTOPASCAL for value in pair]
+            low = min(atmosphere / PASCAL_PER_HECTOPASCAL, LARGEST_WIRE_VALUE - max(sizes))
             low = math.floor(low * 100.0) / 100.0
-            high = low + round(size, 2)
-            values += [high, low] if difference >= 0.0 else [low, high]
+            values += [low + round(size, 2) for size in sizes]
         return ("<" + ",".join(f"{value:.2f}" for value in values) + ">\n").encode(), None
-
-    def vent(self, atmosphere: float) -> tuple[bytes, int | None]:
-        """Equal pressures in every pair: the board opens both chambers."""
-        return self.setpoint([0.0] * (self.chamber_count // 2), atmosphere, 0.0)
 
     def _parse(self, line: str) -> Event | None:
         tag, separator, rest = line.partition(":")

@@ -25,7 +25,6 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from pressure_driver.following import chamber_gauge
 from pressure_driver.protocols import BoardFailure, Echo, Event, HostProtocol, Telemetry
 from pressure_driver.protocols.modbus import (
     BLOCK,
@@ -119,20 +118,19 @@ class FestoHost(HostProtocol):
 
     def setpoint(
         self,
-        differential: Sequence[float],
+        gauge: Sequence[float],
         atmosphere: float,  # noqa: ARG002 - the wire carries gauge pressures
         valid_for: float,  # noqa: ARG002 - the bus node has a patience of its own
     ) -> tuple[bytes, int | None]:
         """Encode one write of all setpoints to 1 mbar; its answer brings the question."""
         values = [
-            min(max(round(gauge / PASCAL_PER_MILLIBAR), 0), LARGEST_SETPOINT)
-            for gauge in chamber_gauge(differential)
+            min(max(round(value / PASCAL_PER_MILLIBAR), 0), LARGEST_SETPOINT) for value in gauge
         ]
         return self._write(values, self._acknowledging), self._transaction
 
-    def emergency(self, atmosphere: float) -> list[bytes]:  # noqa: ARG002
+    def emergency(self, atmosphere: float) -> bytes:  # noqa: ARG002
         """Regulate to the room's pressure, also where slots are being acknowledged."""
-        return [self._write([0] * self.chamber_count, False)]
+        return self._write([0] * self.chamber_count, False)
 
     @property
     def _places(self) -> int:

@@ -162,14 +162,13 @@ class NativeHost(HostProtocol):
 
     def setpoint(
         self,
-        differential: Sequence[float],
+        gauge: Sequence[float],
         atmosphere: float,  # noqa: ARG002 - the wire carries gauge pressures
         valid_for: float,
     ) -> tuple[bytes, int | None]:
         """Encode one gauge pressure a chamber, and how long they hold."""
         body = SETPOINT_HEAD.pack(round(valid_for * 1000.0))
-        for difference in differential:
-            body += struct.pack("<ii", round(max(difference, 0.0)), round(max(-difference, 0.0)))
+        body += struct.pack(f"<{len(gauge)}i", *map(round, gauge))
         sequence = self._next()
         return encode(FrameType.SETPOINT, sequence, body), sequence
 

@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from ament_index_python.packages import get_package_share_directory
 from geometry_msgs.msg import Pose, PoseArray, PoseStamped
-from rclpy.node import Node
 
 from apriltag_tracker.bodies.body_map import BodyMap
 from apriltag_tracker.bodies.forms import message_type, topics_of
+from apriltag_tracker.synthetic.nodes.listening import ShapeListener
 from apriltag_tracker.synthetic.poses import MocapFaults, SyntheticMocap
 from apriltag_tracker.synthetic.shapes import Shape
-from der_msgs.msg import LimbShape
-from limb_interfaces import qos, stamps, topics
-from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
+from limb_interfaces import qos, stamps
 from limb_interfaces.parameters import check_overrides, declare
 from limb_interfaces.runner import run_node
 
@@ -26,26 +23,26 @@ _FRAME = "mocap"
 _FORMS = ("pose_stamped", "pose_array")
 
 
-class SyntheticPosesNode(Node):
+class SyntheticPosesNode(ShapeListener):
     """Subscribes to the twin's shape and publishes the poses of the bodies on it."""
 
     def __init__(self) -> None:
-        super().__init__("synthetic_poses", namespace=topics.NAMESPACE)
+        super().__init__("synthetic_poses")
         share = Path(get_package_share_directory("apriltag_tracker")) / "config" / "bodies.yaml"
         body_map = declare(self, "body_map", str(share), "YAML file: which body is where")
         form = str(declare(self, "form", _FORMS[0], "messages in which poses go", choices=_FORMS))
         seed = declare(self, "seed", 0, "of noise and dropouts", at_least=0)
         swapped = str(declare(self, "swapped", "", "bodies with each other's names: NAME,NAME"))
-        number = self._number
+        number = self.number
         faults = MocapFaults(
-            position_noise=number("position_noise", 1e-4, "of a coordinate [m]", 0.0, 0.01),
-            direction_noise=number("direction_noise", 2e-3, "of a turn [rad]", 0.0, 0.3),
-            dropout=number("dropout", 0.0, "share of frames without a body", 0.0, 1.0),
+            position_noise=number("position_noise", 1e-4, "of a coordinate [m]", 0.01),
+            direction_noise=number("direction_noise", 2e-3, "of a turn [rad]", 0.3),
+            dropout=number("dropout", 0.0, "share of frames without a body", 1.0),
             swapped=tuple(swapped.split(",")) if swapped else (),
-            swapped_from=number("swapped_from", 0.0, "[s] since the first frame", 0.0, 1e6),
-            delay=number("delay", 0.0, "by which stamps are late [s]", -0.5, 0.5),
+            swapped_from=number("swapped_from", 0.0, "[s] since the first frame", 1e6),
+            delay=number("delay", 0.0, "by which stamps are late [s]", 0.5, -0.5),
         )
-        tilt = number("tilt", 0.0, "of the plane of motion against the floor [rad]", -2.0, 2.0)
+        tilt = number("tilt", 0.0, "of the plane of motion against the floor [rad]", 2.0, -2.0)
         check_overrides(self)
         bodies = BodyMap.from_yaml(str(body_map))
         self._mocap = SyntheticMocap(bodies, faults, tilt=tilt, seed=int(seed))
@@ -54,24 +51,11 @@ class SyntheticPosesNode(Node):
             name: self.create_publisher(kind, place, qos.STATES)
             for name, place in topics_of(form, "", bodies.names).items()
         }
-        self._frames = self._refused = 0
-        self._last_shape = time.monotonic()
-        self.create_subscription(LimbShape, topics.TWIN_SHAPE, self._on_shape, qos.STATES)
-        self._diagnostics = DiagnosticsPublisher(self, self._health, "simulated")
+        self.listen("simulated", qos.STATES)
 
-    def _number(
-        self, name: str, default: float, description: str, at_least: float, at_most: float
-    ) -> float:
-        return float(declare(self, name, default, description, at_least=at_least, at_most=at_most))
-
-    def _on_shape(self, message: LimbShape) -> None:
-        self._last_shape = time.monotonic()
-        points = np.array([(point.x, point.y) for point in message.points]).reshape(-1, 2)
-        shape = Shape(np.array(message.arc_length), points, np.array(message.heading))
-        if len(points) < 2 or not len(points) == len(shape.arc_length) == len(shape.heading):
-            self._refused += 1
-            return
-        frame = self._mocap.frame(stamps.nanoseconds(message.header.stamp), shape)
+    def show(self, stamp: int, shape: Shape) -> None:
+        """Tell the poses."""
+        frame = self._mocap.frame(stamp, shape)
         poses = [_pose(*each) for each in zip(frame.positions, frame.quaternions, strict=True)]
         outputs = self._outputs
         found: dict[str, Any] = {"": PoseArray(poses=poses)}
@@ -86,17 +70,6 @@ class SyntheticPosesNode(Node):
             each.header.stamp = stamps.stamp_from_nanoseconds(frame.stamp)
             each.header.frame_id = _FRAME
             outputs[name].publish(each)
-        self._frames += 1
-
-    def _health(self) -> Health:
-        values = {"frames": self._frames, "refused_shapes": self._refused}
-        silent = time.monotonic() - self._last_shape
-        if self._frames == 0:
-            return Health("stale", f"waiting for shapes on {topics.TWIN_SHAPE}", values)
-        if silent > 1.0:
-            said = f"no shape on {topics.TWIN_SHAPE} for {silent:.0f} s: is limb_twin running?"
-            return Health("warning", said, values)
-        return Health("ok", "telling poses", values)
 
 
 def _pose(position: np.ndarray, quaternion: np.ndarray) -> Pose:

@@ -1,1 +1,0 @@
-"""The node that tells the poses of the twin."""

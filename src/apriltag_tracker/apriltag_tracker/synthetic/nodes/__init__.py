@@ -1,0 +1,1 @@
+"""Nodes that show the shape of the twin."""
