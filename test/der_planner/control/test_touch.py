@@ -26,7 +26,9 @@ def calibrated() -> FreeLevel:
     still = Lacking(0.0, np.zeros(2), np.zeros(2), np.zeros(4), 1e-12 * np.eye(4))
     for k in range(4000):
         away = DEVIATION * (-1) ** k
-        free.learn(replace(still, effective=np.array([k % 7, k % 5]) * 1e3, value=away), 0.5)
+        felt = replace(still, effective=np.array([k % 7, k % 5]) * 1e3, value=away)
+        mean, variance = free.expected(felt.effective, 0.5)
+        free.learn(felt, 0.5, away - mean, variance)
     return free
 
 

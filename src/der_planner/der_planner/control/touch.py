@@ -14,9 +14,11 @@ force of the largest likelihood is then linear; the likelihood of the places, ea
 gives place and force with what is in doubt of them.
 
 Without contact the same numbers are not zero either: gains, friction and the camera are a little
-wrong. A segment then lacks c + γ w and some noise, and more where friction turns round; the tip is
-off by a constant and some noise. These are learned while nothing is touched: they are the free
-level. A distance from it that noise would pass once in an hour is a touch.
+wrong. Each is then c + γ·w + e and some noise, with the pressures w of all segments and an e that
+wanders and is forgotten, and is less known where friction turns round or the limb hardly moves:
+what sticks takes any pressure up to its friction. c, γ, e and noise are learned while nothing is
+touched: they are the free level. A distance from it that noise would pass once in an hour is a
+touch.
 """
 
 from __future__ import annotations
@@ -29,6 +31,7 @@ from scipy.special import gammainccinv
 
 from der_planner.arrays import Array
 from der_planner.control.knowledge import Knowledge
+from der_planner.control.nominal import Nominal
 from der_planner.model import RodModel
 from der_planner.model.compliance import compliance
 
@@ -37,24 +40,32 @@ _CORRELATED = 0.3
 """Time after which what the model lacks says something new [s]."""
 _RELEASED = 0.5
 """Share of the threshold below which a touch ends."""
-_FREE_PRESSURE = 250.0
-"""Standard deviation of c and of the noise, of a limb that nothing is known of yet [Pa]."""
-_FREE_GAIN = 0.15
-"""The same of γ."""
-_FREE_TIP = 5e-4
-"""The same of the tip's displacement and of its noise [m]."""
+_FREE_LEVEL = 250.0, 2e-3
+"""Standard deviations of c, of a limb that nothing is known of yet [Pa], and of the tip [m]."""
+_FREE_NOISE = 110.0, 2e-4
+"""The same of e and noise together."""
+_FREE_GAIN, _FREE_COUPLING, _FREE_TIP = 0.15, 0.05, 1e-7
+"""The same of γ by a segment's own pressure and by that of another, and of the tip [m/Pa]."""
+_WANDERS = 0.5
+"""Share of e in its variance and the noise's."""
+_FORGOTTEN = 1.5
+"""Time in which e is forgotten [s]."""
 _FIRST_WORTH = 10.0
 """Time of watching that the guess of the noise is worth [s]."""
 _WATCHED = 600.0
 """Time in which noise that was watched is forgotten [s]."""
 _SAYS_NEW = 0.5
-"""Time after which noise says something new of c, γ and the tip's displacement [s]."""
-_LEARNED_AFTER = 1.0
-"""What no touch follows for so long is learned: contact that begins slowly is not [s]."""
-_FRICTION_WRONG = 0.5
+"""Time after which noise says something new of c, γ and e [s]."""
+_LEARNED_AFTER = 0.4
+"""What is over within that time is learned, touch or not: contact that begins slowly is not [s]."""
+_LONGEST = 1.0
+"""Time between two pictures of which something is learned, at most [s]."""
+_FRICTION_WRONG = 0.6
 """Standard deviation of friction from its model where it turns round, over its largest."""
-_FRICTION_SLIDING = 0.1
+_FRICTION_SLIDING = 0.02
 """Variance elsewhere, over that."""
+_STICKS = 0.01
+"""Rate of a bend angle below which its segment may stick [rad/s]."""
 _LARGEST_FORCE = 2.0
 """Standard deviation of the forces across the limb that are expected [N]."""
 _RUBS = 0.3
@@ -89,24 +100,26 @@ class Lacking:
     covariance: Array
 
     @staticmethod
-    def of(time: float, bend_angles: Array, known: Knowledge, friction: Array) -> Lacking:
+    def of(time: float, nominal: Nominal, known: Knowledge, friction: Array) -> Lacking:
         """Return what the estimator says that the model lacks.
 
         Args:
             time: [s].
-            bend_angles: (M,) [rad].
+            nominal: the model's motion.
             known: the filter's state then.
             friction: (M,) the largest that the model knows [Pa].
         """
-        inputs = len(bend_angles)
+        bend, rate, _ = nominal.at(time)
+        inputs, rate = len(bend), rate + known.parts[1]
         rows = np.zeros((inputs + 2, len(known.mean)))
         rows[:inputs, 2 * inputs : 3 * inputs] = np.eye(inputs)
         rows[:inputs, 3 * inputs : 4 * inputs] = np.diag(known.effective)
         rows[inputs:, 4 * inputs :] = np.eye(2)
         spread = rows @ known.covariance @ rows.T
-        turning = np.minimum(1.0, _FRICTION_SLIDING + 1.0 - known.memory.friction**2)
+        turning = _FRICTION_SLIDING + 1.0 - known.memory.friction**2
+        turning = np.minimum(1.0, turning + 1.0 / (1.0 + (rate / _STICKS) ** 2))
         spread[:inputs, :inputs] += np.diag((_FRICTION_WRONG * friction) ** 2 * turning)
-        return Lacking(time, bend_angles, known.effective, rows @ known.mean, spread)
+        return Lacking(time, bend + known.parts[0], known.effective, rows @ known.mean, spread)
 
 
 @dataclass(frozen=True)
@@ -151,45 +164,62 @@ def untouched(time: float, bend_angles: Array, distance: float = 0.0) -> Touch:
 
 
 class FreeLevel:
-    """What the model lacks of a limb that nothing touches: c + γ w, the tip's displacement, noise.
+    """What the model lacks of a limb that nothing touches: c + γ·w + e, and noise.
 
     Args:
         inputs: M segments.
     """
 
     def __init__(self, inputs: int) -> None:
-        first = np.repeat([_FREE_PRESSURE, _FREE_TIP], [inputs, 2])
-        self._mean = np.zeros((inputs + 2, 2))
-        slope = np.repeat([_FREE_GAIN, 0.0], [inputs, 2])
-        self._covariance = np.square([first, slope]).T[:, None] * np.eye(2)
-        self.noise = first**2
+        level, noise = (np.repeat(each, [inputs, 2]) for each in (_FREE_LEVEL, _FREE_NOISE))
+        slope = np.full((inputs + 2, inputs), _FREE_TIP)
+        slope[:inputs] = _FREE_COUPLING + (_FREE_GAIN - _FREE_COUPLING) * np.eye(inputs)
+        known = np.column_stack([level, slope, np.zeros(len(level))])
+        self._mean = np.zeros_like(known)
+        self._covariance = known[:, :, None] ** 2 * np.eye(known.shape[1])
+        self.noise = noise**2
+        self._covariance[:, -1, -1] = _WANDERS * self.noise
         self._worth = _FIRST_WORTH
 
-    def expected(self, effective: Array) -> tuple[Array, Array]:
-        """Return mean and variance (M + 2,) under an effective pressure (M,) [Pa]; noise counts."""
-        by = self._by(effective)
-        unknown = np.einsum("ia,iab,ib->i", by, self._covariance, by)
-        return (by * self._mean).sum(axis=1), unknown + self.noise
+    def expected(self, effective: Array, ahead: float = 0.0) -> tuple[Array, Array]:
+        """Return mean and variance (M + 2,), noise and all.
 
-    def learn(self, lacking: Lacking, duration: float) -> None:
-        """Take in what held for a time [s] without contact."""
-        by, other = self._by(lacking.effective), np.diag(lacking.covariance)
-        mean, variance = self.expected(lacking.effective)
-        away = lacking.value - mean
-        seen = np.einsum("iab,ib->ia", self._covariance, by)
-        old = _SAYS_NEW / duration * (self.noise + other)
-        gain = seen / (variance - self.noise + old)[:, None]
-        self._mean = self._mean + gain * away[:, None]
-        self._covariance = self._covariance - gain[:, :, None] * seen[:, None, :]
-        # How much of what is away is noise, by what is expected of each.
-        part = self.noise / (variance + other)
-        found = (part * away) ** 2 + self.noise * (1.0 - part)
+        Args:
+            effective: (M,) pressure [Pa].
+            ahead: time since something was learned [s].
+        """
+        kept = np.exp(-ahead / _FORGOTTEN)
+        by = np.concatenate([[1.0], effective, [kept]])
+        left = _WANDERS * (1.0 - kept**2) + 1.0 - _WANDERS
+        return self._mean @ by, by @ self._covariance @ by + left * self.noise
+
+    def learn(self, lacking: Lacking, duration: float, away: Array, variance: Array) -> None:
+        """Take in what held without contact.
+
+        Args:
+            lacking: then.
+            duration: for which it held [s].
+            away: (M + 2,) from what was expected before.
+            variance: (M + 2,) that was expected, see `expected`.
+        """
+        kept = np.exp(-duration / _FORGOTTEN)
+        self._mean[:, -1] *= kept
+        self._covariance[:, -1] *= kept
+        self._covariance[:, :, -1] *= kept
+        self._covariance[:, -1, -1] += _WANDERS * (1.0 - kept**2) * self.noise
+        by, other = np.concatenate([[1.0], lacking.effective, [1.0]]), np.diag(lacking.covariance)
+        seen = self._covariance @ by
+        white = (1.0 - _WANDERS) * self.noise
+        old = _SAYS_NEW / duration * (white + other)
+        gain = seen / (seen @ by + old)[:, None]
+        self._mean += gain * (lacking.value - self._mean @ by)[:, None]
+        self._covariance -= gain[:, :, None] * seen[:, None, :]
+        # How much of what was away is noise and e, by what was expected of each.
+        total = variance + other
+        part = np.minimum(1.0, self.noise / total)
+        found = self.noise * (1.0 + part * (away**2 / total - 1.0))
         self.noise = self.noise + duration / (self._worth + duration) * (found - self.noise)
         self._worth = min(self._worth + duration, _WATCHED)
-
-    def _by(self, effective: Array) -> Array:
-        """Return what c and γ are multiplied by (M + 2, 2)."""
-        return np.column_stack([np.ones(len(self.noise)), np.append(effective, np.zeros(2))])
 
 
 class TouchSense:
@@ -207,37 +237,42 @@ class TouchSense:
         self._places = np.linspace(limb.base_length, limb.length, _PLACES + 1)[1:]
         self.threshold = _chance(_CORRELATED / _HOUR, model.inputs + 2)
         self.newest = untouched(-np.inf, np.zeros(model.inputs))
-        self._recent: deque[tuple[Lacking, float]] = deque()
+        self._recent: deque[tuple[Lacking, float, Array, Array]] = deque()
+        self._learned = self._calm = -np.inf
 
-    def feel(self, time: float, bend_angles: Array, known: Knowledge) -> Touch:
+    def feel(self, time: float, nominal: Nominal, known: Knowledge) -> Touch:
         """Return what a newer state of the estimator says of a touch.
 
         Args:
             time: [s].
-            bend_angles: (M,) [rad].
+            nominal: the model's motion.
             known: the filter's state then.
         """
         segments = self._model.limb.segments
         friction = np.array([s.friction_moment / s.moment_gain for s in segments])
-        return self.look(Lacking.of(time, bend_angles, known, friction))
+        return self.look(Lacking.of(time, nominal, known, friction))
 
     def look(self, lacking: Lacking) -> Touch:
         """Return what a newer instant says of a touch."""
         before = self.newest
-        mean, variance = self.free.expected(lacking.effective)
+        mean, variance = self.free.expected(lacking.effective, lacking.time - self._learned)
         value, noise = lacking.value - mean, lacking.covariance + np.diag(variance)
         distance = float(value @ np.linalg.solve(noise, value)) / self.threshold
         touched = distance > (_RELEASED if before.touched else 1.0)
+        if distance < _RELEASED:
+            self._calm = lacking.time
+        if 0.0 < lacking.time - before.time < _LONGEST:
+            self._recent.append((lacking, lacking.time - before.time, value, variance))
+        if lacking.time - self._calm > _LEARNED_AFTER:
+            self._recent.clear()
         if touched:
             since = before.since if before.touched else lacking.time
             found = locate(self._model, replace(lacking, value=value), noise, self._places)
             self.newest = replace(found, since=since, distance=distance)
-            self._recent.clear()
             return self.newest
         self.newest = untouched(lacking.time, lacking.bend_angles, distance)
-        if distance < _RELEASED and 0.0 < lacking.time - before.time < _LEARNED_AFTER:
-            self._recent.append((lacking, lacking.time - before.time))
         while self._recent and self._recent[0][0].time < lacking.time - _LEARNED_AFTER:
+            self._learned = self._recent[0][0].time
             self.free.learn(*self._recent.popleft())
         return self.newest
 
