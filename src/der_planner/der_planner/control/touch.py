@@ -19,6 +19,10 @@ wanders and is forgotten, and is less known where friction turns round or the li
 what sticks takes any pressure up to its friction. c, γ, e and noise are learned while nothing is
 touched: they are the free level. A distance from it that noise would pass once in an hour is a
 touch.
+
+What begins at once to pull at the tip along gravity, and goes on, is a payload: it is weighed,
+belongs to the free level from then on, and is not a touch. So is one that is taken off. Where
+gravity has no part in the plane, a payload cannot be told.
 """
 
 from __future__ import annotations
@@ -72,6 +76,18 @@ _RUBS = 0.3
 """Standard deviation of a force along the limb, over the force across it at the same place."""
 _LEAST_ALONG = 0.01
 """Force along the limb that is expected anyway, a standard deviation [N]."""
+_EFFECT_WRONG = 0.1
+"""Standard deviation of what a force is said to do, over that."""
+_SETTLES = 0.3
+"""Time in which a payload pulls as much as later: it comes at once, contact grows [s]."""
+_WEIGHED = 0.7
+"""Time for which a payload pulls the same [s]."""
+_TOLD_BY = 4.0
+"""Time after which a touch is no payload [s]."""
+_SAME_WEIGHT = 0.3
+"""Change of the pull, over it, up to which it is the same."""
+_LEAST_GRAVITY = 1.0
+"""In the plane, for which payloads are told [m/s²]."""
 _PLACES = 60
 """Places along the limb that are tried."""
 _PLACE_TOLD = 0.1
@@ -139,6 +155,8 @@ class Touch:
         force: (2,) on the limb [N]; NaN: it cannot be told.
         force_covariance: (2, 2), told or not [N²].
         said: a sentence on what is told; empty while nothing touches.
+        payload: at the tip, beside what was planned [kg].
+        weighed: whether what touches may yet turn out to be a payload.
     """
 
     time: float
@@ -152,6 +170,8 @@ class Touch:
     force: Array
     force_covariance: Array
     said: str
+    payload: float = 0.0
+    weighed: bool = False
 
 
 def untouched(time: float, bend_angles: Array, distance: float = 0.0) -> Touch:
@@ -168,9 +188,14 @@ class FreeLevel:
 
     Args:
         inputs: M segments.
+
+    Attributes:
+        noise: (M + 2,) variance of e and noise together.
+        payload: at the tip, beside what was planned [kg].
     """
 
     def __init__(self, inputs: int) -> None:
+        self.payload = 0.0
         level, noise = (np.repeat(each, [inputs, 2]) for each in (_FREE_LEVEL, _FREE_NOISE))
         slope = np.full((inputs + 2, inputs), _FREE_TIP)
         slope[:inputs] = _FREE_COUPLING + (_FREE_GAIN - _FREE_COUPLING) * np.eye(inputs)
@@ -232,12 +257,14 @@ class TouchSense:
 
     def __init__(self, model: RodModel, free: FreeLevel | None = None) -> None:
         self._model = model
+        self._has_weight = float(np.hypot(*model.limb.gravity[:2])) > _LEAST_GRAVITY
         self.free = free or FreeLevel(model.inputs)
         limb = model.limb
         self._places = np.linspace(limb.base_length, limb.length, _PLACES + 1)[1:]
         self.threshold = _chance(_CORRELATED / _HOUR, model.inputs + 2)
         self.newest = untouched(-np.inf, np.zeros(model.inputs))
         self._recent: deque[tuple[Lacking, float, Array, Array]] = deque()
+        self._weighed: list[tuple[float, float, bool]] = []
         self._learned = self._calm = -np.inf
 
     def feel(self, time: float, nominal: Nominal, known: Knowledge) -> Touch:
@@ -256,6 +283,8 @@ class TouchSense:
         """Return what a newer instant says of a touch."""
         before = self.newest
         mean, variance = self.free.expected(lacking.effective, lacking.time - self._learned)
+        weight = self._weight_effect(lacking.bend_angles)
+        lacking = replace(lacking, value=lacking.value - self.free.payload * weight)
         value, noise = lacking.value - mean, lacking.covariance + np.diag(variance)
         distance = float(value @ np.linalg.solve(noise, value)) / self.threshold
         touched = distance > (_RELEASED if before.touched else 1.0)
@@ -265,16 +294,61 @@ class TouchSense:
             self._recent.append((lacking, lacking.time - before.time, value, variance))
         if lacking.time - self._calm > _LEARNED_AFTER:
             self._recent.clear()
-        if touched:
-            since = before.since if before.touched else lacking.time
-            found = locate(self._model, replace(lacking, value=value), noise, self._places)
-            self.newest = replace(found, since=since, distance=distance)
-            return self.newest
-        self.newest = untouched(lacking.time, lacking.bend_angles, distance)
-        while self._recent and self._recent[0][0].time < lacking.time - _LEARNED_AFTER:
+        away = replace(lacking, value=value)
+        noise = noise + np.diag((_EFFECT_WRONG * value) ** 2)
+        since = before.since if before.touched else lacking.time
+        age = lacking.time - since
+        told = weighed = False
+        if touched and self._has_weight:
+            told, weighed = self._weighs(away, noise, weight, age)
+        if touched and not told:
+            found = locate(self._model, away, noise, self._places)
+            found = replace(found, since=since, distance=distance, weighed=weighed)
+        else:
+            found = untouched(lacking.time, lacking.bend_angles, distance)
+        self.newest = replace(found, payload=self.free.payload)
+        while (
+            not touched and self._recent and self._recent[0][0].time < lacking.time - _LEARNED_AFTER
+        ):
             self._learned = self._recent[0][0].time
             self.free.learn(*self._recent.popleft())
         return self.newest
+
+    def _weight_effect(self, bend_angles: Array) -> Array:
+        """Return what the weight of a kilogram at the tip makes the model lack (M + 2,)."""
+        effect = effects(self._model, bend_angles, self._places[-1:])[0]
+        return effect @ np.array(self._model.limb.gravity[:2])
+
+    def _weighs(self, away: Lacking, noise: Array, weight: Array, age: float) -> tuple[bool, bool]:
+        """Return whether what touches is a payload, and whether it may be one.
+
+        It then belongs to the free level.
+
+        Args:
+            away: from the free level.
+            noise: covariance of it.
+            weight: see `_weight_effect`.
+            age: of the touch [s].
+        """
+        if age == 0.0:
+            self._weighed.clear()
+        inverse = np.linalg.inv(noise)
+        pull = float(weight @ inverse @ weight)
+        mass = float(weight @ inverse @ away.value) / pull
+        left = float(away.value @ inverse @ away.value) - mass**2 * pull
+        alone = left < _chance(_UNLIKELY**2, len(weight) - 1)
+        self._weighed.append((age, mass, alone))
+        ages, masses, alones = np.array(self._weighed).T
+        newest = ages > age - _WEIGHED
+        mean = float(masses[newest].mean())
+        grew = np.abs(masses[ages < _SETTLES]).max() < (1.0 - _SAME_WEIGHT) * abs(mean)
+        taken_off = mean + self.free.payload < -_SAME_WEIGHT * abs(mean)
+        perhaps = age < _TOLD_BY and not grew and not taken_off and (alone or age < _SETTLES)
+        same = np.ptp(masses[newest]) < _SAME_WEIGHT * abs(mean)
+        told = perhaps and same and bool(alones[newest].all()) and age > _SETTLES + _WEIGHED
+        if told:
+            self.free.payload = max(0.0, self.free.payload + mean)
+        return told, perhaps
 
 
 def locate(model: RodModel, lacking: Lacking, noise: Array, places: Array) -> Touch:
