@@ -77,7 +77,7 @@ _RUBS = 0.3
 _LEAST_ALONG = 0.01
 """Force along the limb that is expected anyway, a standard deviation [N]."""
 _EFFECT_WRONG = 0.1
-"""Standard deviation of what a force is said to do, over that."""
+"""Standard deviation of what a weight is said to do, over that."""
 _SETTLES = 0.3
 """Time in which a payload pulls as much as later: it comes at once, contact grows [s]."""
 _WEIGHED = 0.7
@@ -154,7 +154,7 @@ class Touch:
         place_deviation: its standard deviation, told or not [m].
         force: (2,) on the limb [N]; NaN: it cannot be told.
         force_covariance: (2, 2), told or not [N²].
-        said: a sentence on what is told; empty while nothing touches.
+        said: a sentence on what is told; empty while nothing touches or pulls.
         payload: at the tip, beside what was planned [kg].
         weighed: whether what touches may yet turn out to be a payload.
     """
@@ -295,34 +295,37 @@ class TouchSense:
         if lacking.time - self._calm > _LEARNED_AFTER:
             self._recent.clear()
         away = replace(lacking, value=value)
-        noise = noise + np.diag((_EFFECT_WRONG * value) ** 2)
         since = before.since if before.touched else lacking.time
-        age = lacking.time - since
         told = weighed = False
         if touched and self._has_weight:
-            told, weighed = self._weighs(away, noise, weight, age)
+            told, weighed = self._weighs(away, noise, weight, lacking.time - since)
+        payload = self.free.payload
         if touched and not told:
             found = locate(self._model, away, noise, self._places)
-            found = replace(found, since=since, distance=distance, weighed=weighed)
+            said = found.said + (", or a payload" if weighed else "")
+            found = replace(found, since=since, distance=distance, weighed=weighed, said=said)
         else:
-            found = untouched(lacking.time, lacking.bend_angles, distance)
-        self.newest = replace(found, payload=self.free.payload)
-        while (
-            not touched and self._recent and self._recent[0][0].time < lacking.time - _LEARNED_AFTER
-        ):
+            said = f"{1000 * payload:.0f} g more at the tip than planned" if payload else ""
+            found = replace(untouched(lacking.time, lacking.bend_angles, distance), said=said)
+        self.newest = replace(found, payload=payload)
+        learned = lacking.time - _LEARNED_AFTER
+        while not touched and self._recent and self._recent[0][0].time < learned:
             self._learned = self._recent[0][0].time
             self.free.learn(*self._recent.popleft())
         return self.newest
 
     def _weight_effect(self, bend_angles: Array) -> Array:
         """Return what the weight of a kilogram at the tip makes the model lack (M + 2,)."""
+        if not self._has_weight:
+            return np.zeros(self._model.inputs + 2)
         effect = effects(self._model, bend_angles, self._places[-1:])[0]
-        return effect @ np.array(self._model.limb.gravity[:2])
+        weight: Array = effect @ np.array(self._model.limb.gravity[:2])
+        return weight
 
     def _weighs(self, away: Lacking, noise: Array, weight: Array, age: float) -> tuple[bool, bool]:
-        """Return whether what touches is a payload, and whether it may be one.
+        """Return whether what touches is a payload, and whether it may yet turn out to be one.
 
-        It then belongs to the free level.
+        What is told to be one belongs to the free level.
 
         Args:
             away: from the free level.
@@ -332,7 +335,7 @@ class TouchSense:
         """
         if age == 0.0:
             self._weighed.clear()
-        inverse = np.linalg.inv(noise)
+        inverse = np.linalg.inv(noise + np.diag((_EFFECT_WRONG * away.value) ** 2))
         pull = float(weight @ inverse @ weight)
         mass = float(weight @ inverse @ away.value) / pull
         left = float(away.value @ inverse @ away.value) - mass**2 * pull
