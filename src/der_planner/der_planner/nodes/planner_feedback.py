@@ -284,7 +284,9 @@ class Corrector:
             self._warn(f"{text}: {touch.said}")
         if touch.payload != each.payload:
             each.payload = touch.payload
-            self._warn(f"plan {each.schedule.plan_id}: the payload has changed: {touch.said or 'none'}")
+            self._warn(
+                f"plan {each.schedule.plan_id}: the payload has changed: {touch.said or 'none'}"
+            )
         if each.feedback.vents and not each.vented:
             each.vented = True
             self._vent(Trigger.Request())
