@@ -32,7 +32,7 @@ _WATCHED = 600.0
 """Time in which noise that was watched is forgotten [s]."""
 _SAYS_NEW = 0.5
 """Time after which noise says something new of c, γ and e [s]."""
-_FRICTION_WRONG = 0.6
+_FRICTION_WRONG = 0.75
 """Standard deviation of friction from its model where it turns round, over its largest."""
 _FRICTION_SLIDING = 0.02
 """Variance elsewhere, over that."""
