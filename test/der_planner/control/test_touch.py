@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from der_planner.control.free_level import FreeLevel, Lacking
 from der_planner.control.reaction import Reaction
-from der_planner.control.touch import FreeLevel, Lacking, TouchSense, untouched
+from der_planner.control.touch import TouchSense, untouched
 from der_planner.limb import Limb
 from der_planner.model import RodModel
 from der_planner.model.compliance import compliance
@@ -26,7 +27,9 @@ def calibrated() -> FreeLevel:
     still = Lacking(0.0, np.zeros(2), np.zeros(2), np.zeros(4), 1e-12 * np.eye(4))
     for k in range(4000):
         away = DEVIATION * (-1) ** k
-        free.learn(replace(still, effective=np.array([k % 7, k % 5]) * 1e3, value=away), 0.5)
+        felt = replace(still, effective=np.array([k % 7, k % 5]) * 1e3, value=away)
+        mean, variance = free.expected(felt.effective, 0.5)
+        free.learn(felt, 0.5, away - mean, variance)
     return free
 
 
@@ -96,6 +99,32 @@ def test_a_touch_ends_and_the_next_one_has_a_time_of_its_own(model):
     assert [touch.since for touch in said if touch.touched] == [1.0, 1.0, 4.0]
     assert said[1].said
     assert not said[3].said
+
+
+def test_a_payload_is_weighed_and_contact_that_grows_is_not():
+    tilted = RodModel(LIMB.mounted("20"))
+    hung = lacking(tilted, {20: 0.06 * np.array(tilted.limb.gravity[:2])})
+
+    def watched(sense, begin, shares):
+        return [
+            sense.look(replace(hung, time=begin + k / 30, value=share * hung.value))
+            for k, share in enumerate(shares)
+        ]
+
+    sense = TouchSense(tilted, calibrated())
+    put_on = watched(sense, 0.0, np.repeat([0.0, 1.0], [5, 60]))
+    assert put_on[8].touched
+    assert put_on[8].weighed
+    assert not put_on[-1].touched
+    assert put_on[-1].payload == pytest.approx(0.06, rel=0.1)
+    taken_off = watched(sense, 3.0, np.zeros(60))
+    assert taken_off[0].touched
+    assert not taken_off[-1].touched
+    assert taken_off[-1].payload == pytest.approx(0.0, abs=0.006)
+    grown = watched(TouchSense(tilted, calibrated()), 0.0, np.linspace(0.0, 2.0, 60))
+    assert grown[-1].touched
+    assert not grown[-1].weighed
+    assert grown[-1].payload == 0.0
 
 
 @pytest.mark.slow

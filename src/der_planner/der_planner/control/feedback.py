@@ -201,8 +201,7 @@ class Feedback:
         """Look at what the newest picture says of a touch."""
         time = self._estimator.newest
         if np.isfinite(time) and time > self._sense.newest.time:
-            known = self._estimator.at(time)
-            self._sense.feel(time, self._nominal.at(time)[0] + known.parts[0], known)
+            self._sense.feel(time, self._nominal, self._estimator.at(time))
 
     def coming(self) -> tuple[int, Array]:
         """Return the control period of the newest command, and corrections (W, M) [Pa] from it on.

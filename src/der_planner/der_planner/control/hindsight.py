@@ -118,7 +118,7 @@ def touches(plan: Plan, filmed: Filmed) -> list[Touch]:
     sense = TouchSense(nominal.model)
     for j, known in enumerate(estimator.between(0, last)[1]):
         if j % STEPS == 0:
-            touch = sense.feel(j * STEP, nominal.at(j * STEP)[0] + known.parts[0], known)
+            touch = sense.feel(j * STEP, nominal, known)
             best = found.get(touch.since)
             if touch.touched and (best is None or touch.distance > best.distance):
                 found[touch.since] = touch

@@ -69,7 +69,7 @@ class Reaction:
             touch: as it is known now.
             chambers: (M,) differential pressures in them now [Pa].
         """
-        if not (touch.touched and self.acts):
+        if touch.weighed or not (touch.touched and self.acts):
             self._held = None
             return
         if self._held is None:

@@ -13,10 +13,12 @@ friction: the part along the limb is expected to be a share of that across. For 
 force of the largest likelihood is then linear; the likelihood of the places, each with its force,
 gives place and force with what is in doubt of them.
 
-Without contact the same numbers are not zero either: gains, friction and the camera are a little
-wrong. A segment then lacks c + γ w and some noise, and more where friction turns round; the tip is
-off by a constant and some noise. These are learned while nothing is touched: they are the free
-level. A distance from it that noise would pass once in an hour is a touch.
+Without contact the same numbers are not zero either (`der_planner.control.free_level`). A distance
+from that free level which noise would pass once in an hour is a touch.
+
+What begins at once to pull at the tip along gravity, and goes on, is a payload: it is weighed,
+belongs to the free level from then on, and is not a touch. So is one that is taken off. Where
+gravity has no part in the plane, a payload cannot be told.
 """
 
 from __future__ import annotations
@@ -28,7 +30,9 @@ import numpy as np
 from scipy.special import gammainccinv
 
 from der_planner.arrays import Array
+from der_planner.control.free_level import FreeLevel, Lacking
 from der_planner.control.knowledge import Knowledge
+from der_planner.control.nominal import Nominal
 from der_planner.model import RodModel
 from der_planner.model.compliance import compliance
 
@@ -37,76 +41,34 @@ _CORRELATED = 0.3
 """Time after which what the model lacks says something new [s]."""
 _RELEASED = 0.5
 """Share of the threshold below which a touch ends."""
-_FREE_PRESSURE = 250.0
-"""Standard deviation of c and of the noise, of a limb that nothing is known of yet [Pa]."""
-_FREE_GAIN = 0.15
-"""The same of γ."""
-_FREE_TIP = 5e-4
-"""The same of the tip's displacement and of its noise [m]."""
-_FIRST_WORTH = 10.0
-"""Time of watching that the guess of the noise is worth [s]."""
-_WATCHED = 600.0
-"""Time in which noise that was watched is forgotten [s]."""
-_SAYS_NEW = 0.5
-"""Time after which noise says something new of c, γ and the tip's displacement [s]."""
-_LEARNED_AFTER = 1.0
-"""What no touch follows for so long is learned: contact that begins slowly is not [s]."""
-_FRICTION_WRONG = 0.5
-"""Standard deviation of friction from its model where it turns round, over its largest."""
-_FRICTION_SLIDING = 0.1
-"""Variance elsewhere, over that."""
+_LEARNED_AFTER = 0.4
+"""What is over within that time is learned, touch or not: contact that begins slowly is not [s]."""
+_LONGEST = 1.0
+"""Time between two pictures of which something is learned, at most [s]."""
 _LARGEST_FORCE = 2.0
 """Standard deviation of the forces across the limb that are expected [N]."""
 _RUBS = 0.3
 """Standard deviation of a force along the limb, over the force across it at the same place."""
 _LEAST_ALONG = 0.01
 """Force along the limb that is expected anyway, a standard deviation [N]."""
+_EFFECT_WRONG = 0.1
+"""Standard deviation of what a weight is said to do, over that."""
+_SETTLES = 0.3
+"""Time in which a payload pulls as much as later: it comes at once, contact grows [s]."""
+_WEIGHED = 0.7
+"""Time for which a payload pulls the same [s]."""
+_TOLD_BY = 4.0
+"""Time after which a touch is no payload [s]."""
+_SAME_WEIGHT = 0.3
+"""Change of the pull, over it, up to which it is the same."""
+_LEAST_GRAVITY = 1.0
+"""In the plane, for which payloads are told [m/s²]."""
 _PLACES = 60
 """Places along the limb that are tried."""
 _PLACE_TOLD = 0.1
 """Standard deviation of the place, over the limb's length, up to which it is told."""
 _UNLIKELY = 1e-3
 """Probability of what is left of the data below which it is not one force."""
-
-
-@dataclass(frozen=True)
-class Lacking:
-    """What the model lacks of the limb at an instant.
-
-    Attributes:
-        time: [s].
-        bend_angles: (M,) [rad].
-        effective: (M,) pressure w of the model [Pa].
-        value: (M + 2,) pressure that the model lacks [Pa], and the tip's displacement that the
-            bend angles do not explain [m].
-        covariance: of value, with what friction may differ from its model.
-    """
-
-    time: float
-    bend_angles: Array
-    effective: Array
-    value: Array
-    covariance: Array
-
-    @staticmethod
-    def of(time: float, bend_angles: Array, known: Knowledge, friction: Array) -> Lacking:
-        """Return what the estimator says that the model lacks.
-
-        Args:
-            time: [s].
-            bend_angles: (M,) [rad].
-            known: the filter's state then.
-            friction: (M,) the largest that the model knows [Pa].
-        """
-        inputs = len(bend_angles)
-        rows = np.zeros((inputs + 2, len(known.mean)))
-        rows[:inputs, 2 * inputs : 3 * inputs] = np.eye(inputs)
-        rows[:inputs, 3 * inputs : 4 * inputs] = np.diag(known.effective)
-        rows[inputs:, 4 * inputs :] = np.eye(2)
-        spread = rows @ known.covariance @ rows.T
-        turning = np.minimum(1.0, _FRICTION_SLIDING + 1.0 - known.memory.friction**2)
-        spread[:inputs, :inputs] += np.diag((_FRICTION_WRONG * friction) ** 2 * turning)
-        return Lacking(time, bend_angles, known.effective, rows @ known.mean, spread)
 
 
 @dataclass(frozen=True)
@@ -125,7 +87,9 @@ class Touch:
         place_deviation: its standard deviation, told or not [m].
         force: (2,) on the limb [N]; NaN: it cannot be told.
         force_covariance: (2, 2), told or not [N²].
-        said: a sentence on what is told; empty while nothing touches.
+        said: a sentence on what is told; empty while nothing touches or pulls.
+        payload: at the tip, beside what was planned [kg].
+        weighed: whether what touches may yet turn out to be a payload.
     """
 
     time: float
@@ -139,6 +103,8 @@ class Touch:
     force: Array
     force_covariance: Array
     said: str
+    payload: float = 0.0
+    weighed: bool = False
 
 
 def untouched(time: float, bend_angles: Array, distance: float = 0.0) -> Touch:
@@ -148,48 +114,6 @@ def untouched(time: float, bend_angles: Array, distance: float = 0.0) -> Touch:
     pressure, never = np.full(len(bend_angles), np.nan), np.nan
     about = pressure, distance, np.nan, np.nan, nothing, unknown, ""
     return Touch(time, bend_angles, False, never, *about)
-
-
-class FreeLevel:
-    """What the model lacks of a limb that nothing touches: c + γ w, the tip's displacement, noise.
-
-    Args:
-        inputs: M segments.
-    """
-
-    def __init__(self, inputs: int) -> None:
-        first = np.repeat([_FREE_PRESSURE, _FREE_TIP], [inputs, 2])
-        self._mean = np.zeros((inputs + 2, 2))
-        slope = np.repeat([_FREE_GAIN, 0.0], [inputs, 2])
-        self._covariance = np.square([first, slope]).T[:, None] * np.eye(2)
-        self.noise = first**2
-        self._worth = _FIRST_WORTH
-
-    def expected(self, effective: Array) -> tuple[Array, Array]:
-        """Return mean and variance (M + 2,) under an effective pressure (M,) [Pa]; noise counts."""
-        by = self._by(effective)
-        unknown = np.einsum("ia,iab,ib->i", by, self._covariance, by)
-        return (by * self._mean).sum(axis=1), unknown + self.noise
-
-    def learn(self, lacking: Lacking, duration: float) -> None:
-        """Take in what held for a time [s] without contact."""
-        by, other = self._by(lacking.effective), np.diag(lacking.covariance)
-        mean, variance = self.expected(lacking.effective)
-        away = lacking.value - mean
-        seen = np.einsum("iab,ib->ia", self._covariance, by)
-        old = _SAYS_NEW / duration * (self.noise + other)
-        gain = seen / (variance - self.noise + old)[:, None]
-        self._mean = self._mean + gain * away[:, None]
-        self._covariance = self._covariance - gain[:, :, None] * seen[:, None, :]
-        # How much of what is away is noise, by what is expected of each.
-        part = self.noise / (variance + other)
-        found = (part * away) ** 2 + self.noise * (1.0 - part)
-        self.noise = self.noise + duration / (self._worth + duration) * (found - self.noise)
-        self._worth = min(self._worth + duration, _WATCHED)
-
-    def _by(self, effective: Array) -> Array:
-        """Return what c and γ are multiplied by (M + 2, 2)."""
-        return np.column_stack([np.ones(len(self.noise)), np.append(effective, np.zeros(2))])
 
 
 class TouchSense:
@@ -202,44 +126,101 @@ class TouchSense:
 
     def __init__(self, model: RodModel, free: FreeLevel | None = None) -> None:
         self._model = model
+        self._has_weight = float(np.hypot(*model.limb.gravity[:2])) > _LEAST_GRAVITY
         self.free = free or FreeLevel(model.inputs)
         limb = model.limb
         self._places = np.linspace(limb.base_length, limb.length, _PLACES + 1)[1:]
         self.threshold = _chance(_CORRELATED / _HOUR, model.inputs + 2)
         self.newest = untouched(-np.inf, np.zeros(model.inputs))
-        self._recent: deque[tuple[Lacking, float]] = deque()
+        self._recent: deque[tuple[Lacking, float, Array, Array]] = deque()
+        self._weighed: list[tuple[float, float, bool]] = []
+        self._learned = self._calm = -np.inf
 
-    def feel(self, time: float, bend_angles: Array, known: Knowledge) -> Touch:
+    def feel(self, time: float, nominal: Nominal, known: Knowledge) -> Touch:
         """Return what a newer state of the estimator says of a touch.
 
         Args:
             time: [s].
-            bend_angles: (M,) [rad].
+            nominal: the model's motion.
             known: the filter's state then.
         """
         segments = self._model.limb.segments
         friction = np.array([s.friction_moment / s.moment_gain for s in segments])
-        return self.look(Lacking.of(time, bend_angles, known, friction))
+        return self.look(Lacking.of(time, nominal, known, friction))
 
     def look(self, lacking: Lacking) -> Touch:
         """Return what a newer instant says of a touch."""
         before = self.newest
-        mean, variance = self.free.expected(lacking.effective)
+        mean, variance = self.free.expected(lacking.effective, lacking.time - self._learned)
+        weight = self._weight_effect(lacking.bend_angles)
+        lacking = replace(lacking, value=lacking.value - self.free.payload * weight)
         value, noise = lacking.value - mean, lacking.covariance + np.diag(variance)
         distance = float(value @ np.linalg.solve(noise, value)) / self.threshold
         touched = distance > (_RELEASED if before.touched else 1.0)
-        if touched:
-            since = before.since if before.touched else lacking.time
-            found = locate(self._model, replace(lacking, value=value), noise, self._places)
-            self.newest = replace(found, since=since, distance=distance)
+        if distance < _RELEASED:
+            self._calm = lacking.time
+        if 0.0 < lacking.time - before.time < _LONGEST:
+            self._recent.append((lacking, lacking.time - before.time, value, variance))
+        if lacking.time - self._calm > _LEARNED_AFTER:
             self._recent.clear()
-            return self.newest
-        self.newest = untouched(lacking.time, lacking.bend_angles, distance)
-        if distance < _RELEASED and 0.0 < lacking.time - before.time < _LEARNED_AFTER:
-            self._recent.append((lacking, lacking.time - before.time))
-        while self._recent and self._recent[0][0].time < lacking.time - _LEARNED_AFTER:
+        away = replace(lacking, value=value)
+        since = before.since if before.touched else lacking.time
+        told = weighed = False
+        if touched and self._has_weight:
+            told, weighed = self._weighs(away, noise, weight, lacking.time - since)
+        payload = self.free.payload
+        if touched and not told:
+            found = locate(self._model, away, noise, self._places)
+            said = found.said + (", or a payload" if weighed else "")
+            found = replace(found, since=since, distance=distance, weighed=weighed, said=said)
+        else:
+            said = f"{1000 * payload:.0f} g more at the tip than planned" if payload else ""
+            found = replace(untouched(lacking.time, lacking.bend_angles, distance), said=said)
+        self.newest = replace(found, payload=payload)
+        learned = lacking.time - _LEARNED_AFTER
+        while not touched and self._recent and self._recent[0][0].time < learned:
+            self._learned = self._recent[0][0].time
             self.free.learn(*self._recent.popleft())
         return self.newest
+
+    def _weight_effect(self, bend_angles: Array) -> Array:
+        """Return what the weight of a kilogram at the tip makes the model lack (M + 2,)."""
+        if not self._has_weight:
+            return np.zeros(self._model.inputs + 2)
+        effect = effects(self._model, bend_angles, self._places[-1:])[0]
+        weight: Array = effect @ np.array(self._model.limb.gravity[:2])
+        return weight
+
+    def _weighs(self, away: Lacking, noise: Array, weight: Array, age: float) -> tuple[bool, bool]:
+        """Return whether what touches is a payload, and whether it may yet turn out to be one.
+
+        What is told to be one belongs to the free level.
+
+        Args:
+            away: from the free level.
+            noise: covariance of it.
+            weight: see `_weight_effect`.
+            age: of the touch [s].
+        """
+        if age == 0.0:
+            self._weighed.clear()
+        inverse = np.linalg.inv(noise + np.diag((_EFFECT_WRONG * away.value) ** 2))
+        pull = float(weight @ inverse @ weight)
+        mass = float(weight @ inverse @ away.value) / pull
+        left = float(away.value @ inverse @ away.value) - mass**2 * pull
+        alone = left < _chance(_UNLIKELY**2, len(weight) - 1)
+        self._weighed.append((age, mass, alone))
+        ages, masses, alones = np.array(self._weighed).T
+        newest = ages > age - _WEIGHED
+        mean = float(masses[newest].mean())
+        grew = np.abs(masses[ages < _SETTLES]).max() < (1.0 - _SAME_WEIGHT) * abs(mean)
+        taken_off = mean + self.free.payload < -_SAME_WEIGHT * abs(mean)
+        perhaps = age < _TOLD_BY and not grew and not taken_off and (alone or age < _SETTLES)
+        same = np.ptp(masses[newest]) < _SAME_WEIGHT * abs(mean)
+        told = perhaps and same and bool(alones[newest].all()) and age > _SETTLES + _WEIGHED
+        if told:
+            self.free.payload = max(0.0, self.free.payload + mean)
+        return told, perhaps
 
 
 def locate(model: RodModel, lacking: Lacking, noise: Array, places: Array) -> Touch:

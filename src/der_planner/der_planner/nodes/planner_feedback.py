@@ -59,6 +59,7 @@ class _Corrected:
         self.warned = 0
         self.touched = self.felt = -math.inf
         self.vented = False
+        self.payload = feedback.touch.payload
 
     def time_of(self, stamp: int) -> float:
         """Return an instant [ns] in the plan's seconds."""
@@ -281,6 +282,11 @@ class Corrector:
             each.touched = touch.since
             text = f"plan {each.schedule.plan_id}, {touch.since:.2f} s: something touches the limb"
             self._warn(f"{text}: {touch.said}")
+        if touch.payload != each.payload:
+            each.payload = touch.payload
+            self._warn(
+                f"plan {each.schedule.plan_id}: the payload has changed: {touch.said or 'none'}"
+            )
         if each.feedback.vents and not each.vented:
             each.vented = True
             self._vent(Trigger.Request())

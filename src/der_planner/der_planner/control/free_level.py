@@ -1,0 +1,146 @@
+"""What the model lacks of a limb that nothing touches, by the estimator: the free level.
+
+Gains, friction and the camera are a little wrong. What is lacking (`Lacking.value`) is then
+c + γ·w + e and some noise, with the pressures w of all segments and an e that wanders and is
+forgotten. It is less known where friction turns round or the limb hardly moves: what sticks takes
+any pressure up to its friction. c, γ, e and noise are learned while nothing is touched.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from der_planner.arrays import Array
+from der_planner.control.knowledge import Knowledge
+from der_planner.control.nominal import Nominal
+
+_FREE_LEVEL = 250.0, 2e-3
+"""Standard deviations of c, of a limb that nothing is known of yet [Pa], and of the tip [m]."""
+_FREE_NOISE = 110.0, 2e-4
+"""The same of e and noise together."""
+_FREE_GAIN, _FREE_COUPLING, _FREE_TIP = 0.15, 0.05, 1e-7
+"""The same of γ by a segment's own pressure and by that of another, and of the tip [m/Pa]."""
+_WANDERS = 0.5
+"""Share of e in its variance and the noise's."""
+_FORGOTTEN = 1.5
+"""Time in which e is forgotten [s]."""
+_FIRST_WORTH = 10.0
+"""Time of watching that the guess of the noise is worth [s]."""
+_WATCHED = 600.0
+"""Time in which noise that was watched is forgotten [s]."""
+_SAYS_NEW = 0.5
+"""Time after which noise says something new of c, γ and e [s]."""
+_FRICTION_WRONG = 0.75
+"""Standard deviation of friction from its model where it turns round, over its largest."""
+_FRICTION_SLIDING = 0.02
+"""Variance elsewhere, over that."""
+_STICKS = 0.01
+"""Rate of a bend angle below which its segment may stick [rad/s]."""
+
+
+@dataclass(frozen=True)
+class Lacking:
+    """What the model lacks of the limb at an instant.
+
+    Attributes:
+        time: [s].
+        bend_angles: (M,) [rad].
+        effective: (M,) pressure w of the model [Pa].
+        value: (M + 2,) pressure that the model lacks [Pa], and the tip's displacement that the
+            bend angles do not explain [m].
+        covariance: of value, with what friction may differ from its model.
+    """
+
+    time: float
+    bend_angles: Array
+    effective: Array
+    value: Array
+    covariance: Array
+
+    @staticmethod
+    def of(time: float, nominal: Nominal, known: Knowledge, friction: Array) -> Lacking:
+        """Return what the estimator says that the model lacks.
+
+        Args:
+            time: [s].
+            nominal: the model's motion.
+            known: the filter's state then.
+            friction: (M,) the largest that the model knows [Pa].
+        """
+        bend, rate, _ = nominal.at(time)
+        inputs, rate = len(bend), rate + known.parts[1]
+        rows = np.zeros((inputs + 2, len(known.mean)))
+        rows[:inputs, 2 * inputs : 3 * inputs] = np.eye(inputs)
+        rows[:inputs, 3 * inputs : 4 * inputs] = np.diag(known.effective)
+        rows[inputs:, 4 * inputs :] = np.eye(2)
+        spread = rows @ known.covariance @ rows.T
+        turning = _FRICTION_SLIDING + 1.0 - known.memory.friction**2
+        turning = np.minimum(1.0, turning + 1.0 / (1.0 + (rate / _STICKS) ** 2))
+        spread[:inputs, :inputs] += np.diag((_FRICTION_WRONG * friction) ** 2 * turning)
+        return Lacking(time, bend + known.parts[0], known.effective, rows @ known.mean, spread)
+
+
+class FreeLevel:
+    """What the model lacks of a limb that nothing touches: c + γ·w + e, and noise.
+
+    Args:
+        inputs: M segments.
+
+    Attributes:
+        noise: (M + 2,) variance of e and noise together.
+        payload: at the tip, beside what was planned [kg].
+    """
+
+    def __init__(self, inputs: int) -> None:
+        self.payload = 0.0
+        level, noise = (np.repeat(each, [inputs, 2]) for each in (_FREE_LEVEL, _FREE_NOISE))
+        slope = np.full((inputs + 2, inputs), _FREE_TIP)
+        slope[:inputs] = _FREE_COUPLING + (_FREE_GAIN - _FREE_COUPLING) * np.eye(inputs)
+        known = np.column_stack([level, slope, np.zeros(len(level))])
+        self._mean = np.zeros_like(known)
+        self._covariance = known[:, :, None] ** 2 * np.eye(known.shape[1])
+        self.noise = noise**2
+        self._covariance[:, -1, -1] = _WANDERS * self.noise
+        self._worth = _FIRST_WORTH
+
+    def expected(self, effective: Array, ahead: float = 0.0) -> tuple[Array, Array]:
+        """Return mean and variance (M + 2,), noise and all.
+
+        Args:
+            effective: (M,) pressure [Pa].
+            ahead: time since something was learned [s].
+        """
+        kept = np.exp(-ahead / _FORGOTTEN)
+        by = np.concatenate([[1.0], effective, [kept]])
+        left = _WANDERS * (1.0 - kept**2) + 1.0 - _WANDERS
+        return self._mean @ by, by @ self._covariance @ by + left * self.noise
+
+    def learn(self, lacking: Lacking, duration: float, away: Array, variance: Array) -> None:
+        """Take in what held without contact.
+
+        Args:
+            lacking: then.
+            duration: for which it held [s].
+            away: (M + 2,) from what was expected before.
+            variance: (M + 2,) that was expected, see `expected`.
+        """
+        kept = np.exp(-duration / _FORGOTTEN)
+        self._mean[:, -1] *= kept
+        self._covariance[:, -1] *= kept
+        self._covariance[:, :, -1] *= kept
+        self._covariance[:, -1, -1] += _WANDERS * (1.0 - kept**2) * self.noise
+        by, other = np.concatenate([[1.0], lacking.effective, [1.0]]), np.diag(lacking.covariance)
+        seen = self._covariance @ by
+        white = (1.0 - _WANDERS) * self.noise
+        old = _SAYS_NEW / duration * (white + other)
+        gain = seen / (seen @ by + old)[:, None]
+        self._mean += gain * (lacking.value - self._mean @ by)[:, None]
+        self._covariance -= gain[:, :, None] * seen[:, None, :]
+        # How much of what was away is noise and e, by what was expected of each.
+        total = variance + other
+        part = np.minimum(1.0, self.noise / total)
+        found = self.noise * (1.0 + part * (away**2 / total - 1.0))
+        self.noise = self.noise + duration / (self._worth + duration) * (found - self.noise)
+        self._worth = min(self._worth + duration, _WATCHED)
