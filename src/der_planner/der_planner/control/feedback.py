@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 from threadpoolctl import ThreadpoolController
 
 from der_planner.arrays import Array
+from der_planner.control.benefit import Benefit
 from der_planner.control.estimation import Estimator
 from der_planner.control.horizon import Horizon
 from der_planner.control.knowledge import Estimate
@@ -67,6 +68,7 @@ class Feedback:
             self._chambers = ChamberLog(self._nominal)
             self._estimator = Estimator(self._nominal, self._chambers)
             self._horizon = Horizon(self._nominal, self._chambers, authority)
+            self._benefit = Benefit(self._nominal)
             self._sense = TouchSense(self._nominal.model)
             self._reaction = Reaction(self._nominal.model, reaction, force_limit)
             self._horizon.warm_up(self._estimator.beginning(0))
@@ -169,6 +171,7 @@ class Feedback:
             supervisor.in_time()
         planned, before = self._nominal.command(k), self._chambers.sent(k - 1)
         correction, swing, missed = np.zeros_like(planned), 0.0, 0.0
+        wanted, worth, expected = correction, correction, np.zeros((2, 2))
         try:
             # Matrices of some ten rows: more threads only get into other processes' way.
             with _THREADS.limit(limits=1, user_api="blas"):
@@ -179,7 +182,14 @@ class Feedback:
                 missed = self._estimator.missed(known, k)
                 share = supervisor.advance(instant, age, known.strange)
                 if share > 0.0:
-                    correction = share * self._horizon.solve(k, known)
+                    wanted = share * self._horizon.solve(k, known)
+                    seen = round(self._estimator.newest / CONTROL_PERIOD)
+                    gap = self._estimator.gap(seen)
+                    if age < 0.5:
+                        self._benefit.see(seen, gap)
+                    worth = self._benefit.worth(wanted[None])[0]
+                    correction = self._benefit.share * worth
+                    expected = np.stack([self._estimator.gap(k), gap])
         except np.linalg.LinAlgError:
             correction[:] = np.nan
         if not np.isfinite(correction).all():
@@ -188,11 +198,12 @@ class Feedback:
         air = self._nominal.model.air
         chambers = self._chambers.during(np.array([k * STEPS - 1]))[0]
         self._reaction.follow(planned, self.touch, chambers)
-        wanted = self._reaction.allowed(planned + correction)
-        command: Array = within_limits(wanted[None], air, CONTROL_PERIOD, before)[0][0]
+        asked_for = self._reaction.allowed(planned + correction)
+        command: Array = within_limits(asked_for[None], air, CONTROL_PERIOD, before)[0][0]
         if self.touch.touched and self._reaction.acts:
             missed = 0.0  # What is in the way keeps the tip away.
         supervisor.sent(instant, command - planned, swing, missed)
+        self._benefit.sent(k, wanted, command - planned, worth, expected)
         self._chambers.send(k, command)
         self._estimator.changed(instant)
         return command
@@ -210,7 +221,7 @@ class Feedback:
         Those after the first are what would follow if nothing new were seen.
         """
         first, corrections = self._horizon.solution
-        corrections = self._supervisor.share * corrections
+        corrections = self._benefit.share * self._benefit.worth(self._supervisor.share * corrections)
         if self.touch.touched and self._reaction.acts:
             planned = self._nominal.commands[self._nominal.periods(first + np.arange(_SOON))]
             for ahead, each in enumerate(planned):
