@@ -116,6 +116,7 @@ class Feedback:
         self._chambers.take_over(other._chambers, round(time / CONTROL_PERIOD))
         with _THREADS.limit(limits=1, user_api="blas"):
             self._estimator.take_over(other._estimator, time)
+        self._benefit.take_over(other._benefit)
         self._sense.free = other._sense.free
         # What ended the other's feedback does not count here.
         self._supervisor.share = other.share
@@ -171,7 +172,7 @@ class Feedback:
             supervisor.in_time()
         planned, before = self._nominal.command(k), self._chambers.sent(k - 1)
         correction, swing, missed = np.zeros_like(planned), 0.0, 0.0
-        wanted, worth, expected = correction, correction, np.zeros((2, 2))
+        wanted = correction
         try:
             # Matrices of some ten rows: more threads only get into other processes' way.
             with _THREADS.limit(limits=1, user_api="blas"):
@@ -184,12 +185,8 @@ class Feedback:
                 if share > 0.0:
                     wanted = share * self._horizon.solve(k, known)
                     seen = round(self._estimator.newest / CONTROL_PERIOD)
-                    gap = self._estimator.gap(seen)
-                    if age < 0.5:
-                        self._benefit.see(seen, gap)
-                    worth = self._benefit.worth(wanted[None])[0]
-                    correction = self._benefit.share * worth
-                    expected = np.stack([self._estimator.gap(k), gap])
+                    self._benefit.see(seen, self._estimator.gap(seen))
+                    correction = self._benefit.share * wanted
         except np.linalg.LinAlgError:
             correction[:] = np.nan
         if not np.isfinite(correction).all():
@@ -203,7 +200,7 @@ class Feedback:
         if self.touch.touched and self._reaction.acts:
             missed = 0.0  # What is in the way keeps the tip away.
         supervisor.sent(instant, command - planned, swing, missed)
-        self._benefit.sent(k, wanted, command - planned, worth, expected)
+        self._benefit.sent(k, command - planned, wanted)
         self._chambers.send(k, command)
         self._estimator.changed(instant)
         return command
@@ -221,7 +218,7 @@ class Feedback:
         Those after the first are what would follow if nothing new were seen.
         """
         first, corrections = self._horizon.solution
-        corrections = self._benefit.share * self._benefit.worth(self._supervisor.share * corrections)
+        corrections = self._benefit.share * self._supervisor.share * corrections
         if self.touch.touched and self._reaction.acts:
             planned = self._nominal.commands[self._nominal.periods(first + np.arange(_SOON))]
             for ahead, each in enumerate(planned):

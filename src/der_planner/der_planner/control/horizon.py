@@ -90,7 +90,6 @@ class Horizon:
         self._changes = weight * np.concatenate([np.diff(each, axis=0)[1:], np.diff(each, 2, 0)])
         self._knot_changes = np.kron(self._changes[:, 2:] @ self._hats, np.eye(inputs))
         self.solution = 0, np.zeros((self.window, inputs))
-        self._wanted: dict[int, Array] = {}
 
     def solve(self, first: int, known: Knowledge) -> Array:
         """Return the correction (M,) [Pa] of the command of control period ``first``.
@@ -99,7 +98,9 @@ class Horizon:
             first: period.
             known: of the limb at its beginning.
         """
-        sent = self._before(first)
+        sent = np.array(
+            [self._chambers.sent(k) - self._nominal.command(k) for k in (first - 2, first - 1)]
+        )
         ahead = self._ahead(first, known)
         guess = self._kept(first, self._begin(first, sent[1] - ahead[1]) + ahead[2:])
         # What costs nothing (W + 2, M), less what was sent in the two periods before: r is a
@@ -109,23 +110,13 @@ class Horizon:
         best = self._searched(here, self._programme(here, known, free), known, free)
         self._guess = first, best.correction - ahead[2:]
         self.solution = first, best.correction
-        self._wanted = {first - 1: sent[1], first: best.correction[0]}
         correction_now: Array = best.correction[0]
         return correction_now
 
     def warm_up(self, known: Knowledge) -> None:
         """Compile, or load from the cache, what `solve` calls."""
         self.solve(0, known)
-        self._guess, self.solution, self._wanted = None, (0, np.zeros_like(self.solution[1])), {}
-
-    def _before(self, first: int) -> Array:
-        """Return the corrections (2, M) [Pa] of the two periods before: wanted ones, else sent.
-
-        A share of what is wanted is sent: what is wanted goes on from what was, not from the share.
-        """
-        sent = [self._chambers.sent(k) - self._nominal.command(k) for k in (first - 2, first - 1)]
-        wanted = [self._wanted.get(k) for k in (first - 2, first - 1)]
-        return np.array([s if w is None else w for s, w in zip(sent, wanted, strict=True)])
+        self._guess, self.solution = None, (0, np.zeros_like(self.solution[1]))
 
     def _programme(self, here: _Rolled, known: Knowledge, free: Array) -> Array:
         """Return the change (W, M) [Pa] of corrections that is best to first order.
@@ -163,8 +154,7 @@ class Horizon:
             ]
         )
         low, high = np.sort(bounds, axis=0)
-        before = self._nominal.command(here.first - 1) + self._before(here.first)[1]
-        command = np.concatenate([before[None], planned + guess])
+        command = np.concatenate([self._chambers.sent(here.first - 1)[None], planned + guess])
         steps, largest = np.diff(command, axis=0), air.slew_limit * CONTROL_PERIOD
         moves = np.diff(self._hats, axis=0, prepend=0.0)
         rows = (
@@ -222,8 +212,9 @@ class Horizon:
         """
         planned = self._planned(first)
         wanted = planned + np.clip(correction, -self._authority, self._authority)
-        before = self._nominal.command(first - 1) + self._before(first)[1]
-        commands, _ = within_limits(wanted, self._air, CONTROL_PERIOD, before)
+        commands, _ = within_limits(
+            wanted, self._air, CONTROL_PERIOD, self._chambers.sent(first - 1)
+        )
         return commands - planned
 
     def _begin(self, first: int, last: Array) -> Array:
