@@ -25,9 +25,9 @@ from der_planner.model import CONTROL_PERIOD
 
 _SMOOTH = 0.3
 """Time constant of the two low-passes in front of the sums [s]."""
-_FORGET = 5.0
+_FORGET = 20.0
 """Time in which what corrections have brought is forgotten [s]."""
-_DOUBT = 0.003
+_DOUBT = 0.002
 """√(P / 1 s), over the limb's length."""
 
 
@@ -78,9 +78,9 @@ class Benefit:
         jacobian = self._nominal.kinematics.tip_jacobians(self._nominal.bend[row])
         moved = pressure @ (jacobian @ self._bend[row]).T
         now = np.stack([missed - moved[0], moved[1]])
-        for stage in self._smooth:
-            stage += _step(passed, _SMOOTH) * (now - stage)
-            now = stage
+        for stage in range(len(self._smooth)):
+            self._smooth[stage] += _step(passed, _SMOOTH) * (now - self._smooth[stage])
+            now = self._smooth[stage]
         alone, wanted = now
         fresh = np.array([-alone @ wanted, wanted @ wanted])
         self._sums = self._sums + passed * fresh - _step(passed, _FORGET) * self._sums

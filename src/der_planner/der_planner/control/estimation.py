@@ -180,12 +180,10 @@ class Estimator:
 
     def missed(self, known: Knowledge, k: int) -> float:
         """Return the distance of the tip from r̄ [m] at control period ``k``."""
-        return float(np.linalg.norm(self._gap(known, k)))
+        return float(np.linalg.norm(self.gap(known, k)))
 
-    def gap(self, k: int) -> Array:
-        return self._gap(self.at(k * CONTROL_PERIOD), k)
-
-    def _gap(self, known: Knowledge, k: int) -> Array:
+    def gap(self, known: Knowledge, k: int) -> Array:
+        """Return the tip less r̄ (2,) [m] at control period ``k``."""
         nominal = self.nominal
         row = nominal.periods(k)
         moved = nominal.moved_tip(nominal.bend[row], known.mean[: self.inputs])

@@ -9,8 +9,8 @@
 All times are seconds since the plan's first setpoint. Nothing here knows the present: a command is
 based on what was told before it was asked for.
 
-A `Supervisor` decides on the share of the corrections that is sent; what is done where something
-touches the limb is a `Reaction`.
+A `Supervisor` takes corrections back where they cannot help, a `Benefit` sends the share of them
+that brings the tip nearer; what is done where something touches the limb is a `Reaction`.
 """
 
 from __future__ import annotations
@@ -172,7 +172,7 @@ class Feedback:
             supervisor.in_time()
         planned, before = self._nominal.command(k), self._chambers.sent(k - 1)
         correction, swing, missed = np.zeros_like(planned), 0.0, 0.0
-        wanted = correction
+        wanted = np.zeros_like(planned)
         try:
             # Matrices of some ten rows: more threads only get into other processes' way.
             with _THREADS.limit(limits=1, user_api="blas"):
@@ -185,18 +185,19 @@ class Feedback:
                 if share > 0.0:
                     wanted = share * self._horizon.solve(k, known)
                     seen = round(self._estimator.newest / CONTROL_PERIOD)
-                    self._benefit.see(seen, self._estimator.gap(seen))
+                    shown = self._estimator.at(seen * CONTROL_PERIOD)
+                    self._benefit.see(seen, self._estimator.gap(shown, seen))
                     correction = self._benefit.share * wanted
         except np.linalg.LinAlgError:
             correction[:] = np.nan
         if not np.isfinite(correction).all():
             supervisor.stop(instant, "inconsistent", np.inf)
-            correction = np.zeros_like(planned)
+            correction = wanted = np.zeros_like(planned)
         air = self._nominal.model.air
         chambers = self._chambers.during(np.array([k * STEPS - 1]))[0]
         self._reaction.follow(planned, self.touch, chambers)
-        asked_for = self._reaction.allowed(planned + correction)
-        command: Array = within_limits(asked_for[None], air, CONTROL_PERIOD, before)[0][0]
+        allowed = self._reaction.allowed(planned + correction)
+        command: Array = within_limits(allowed[None], air, CONTROL_PERIOD, before)[0][0]
         if self.touch.touched and self._reaction.acts:
             missed = 0.0  # What is in the way keeps the tip away.
         supervisor.sent(instant, command - planned, swing, missed)
