@@ -25,7 +25,7 @@ from der_planner.model import CONTROL_PERIOD
 
 _SMOOTH = 0.3
 """Time constant of the two low-passes in front of the sums [s]."""
-_FORGET = 20.0
+_FORGET = 5.0
 """Time in which what corrections have brought is forgotten [s]."""
 _DOUBT = 0.002
 """√(P / 1 s), over the limb's length."""
