@@ -180,11 +180,15 @@ class Estimator:
 
     def missed(self, known: Knowledge, k: int) -> float:
         """Return the distance of the tip from r̄ [m] at control period ``k``."""
+        return float(np.linalg.norm(self.gap(known, k)))
+
+    def gap(self, known: Knowledge, k: int) -> Array:
+        """Return the tip less r̄ (2,) [m] at control period ``k``."""
         nominal = self.nominal
         row = nominal.periods(k)
         moved = nominal.moved_tip(nominal.bend[row], known.mean[: self.inputs])
-        gap = nominal.tip[row] + moved + known.mean[-2:] - nominal.reference[row]
-        return float(np.linalg.norm(gap))
+        gap: Array = nominal.tip[row] + moved + known.mean[-2:] - nominal.reference[row]
+        return gap
 
     def between(self, first: int, last: int) -> tuple[list[Knowledge], list[Knowledge]]:
         """Return the predicted and the corrected state at fine steps ``first`` … ``last``.

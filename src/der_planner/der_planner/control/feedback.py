@@ -9,8 +9,8 @@
 All times are seconds since the plan's first setpoint. Nothing here knows the present: a command is
 based on what was told before it was asked for.
 
-A `Supervisor` decides on the share of the corrections that is sent; what is done where something
-touches the limb is a `Reaction`.
+A `Supervisor` takes corrections back where they cannot help, a `Benefit` sends the share of them
+that brings the tip nearer; what is done where something touches the limb is a `Reaction`.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 from threadpoolctl import ThreadpoolController
 
 from der_planner.arrays import Array
+from der_planner.control.benefit import Benefit
 from der_planner.control.estimation import Estimator
 from der_planner.control.horizon import Horizon
 from der_planner.control.knowledge import Estimate
@@ -67,6 +68,7 @@ class Feedback:
             self._chambers = ChamberLog(self._nominal)
             self._estimator = Estimator(self._nominal, self._chambers)
             self._horizon = Horizon(self._nominal, self._chambers, authority)
+            self._benefit = Benefit(self._nominal)
             self._sense = TouchSense(self._nominal.model)
             self._reaction = Reaction(self._nominal.model, reaction, force_limit)
             self._horizon.warm_up(self._estimator.beginning(0))
@@ -114,6 +116,7 @@ class Feedback:
         self._chambers.take_over(other._chambers, round(time / CONTROL_PERIOD))
         with _THREADS.limit(limits=1, user_api="blas"):
             self._estimator.take_over(other._estimator, time)
+        self._benefit.take_over(other._benefit)
         self._sense.free = other._sense.free
         # What ended the other's feedback does not count here.
         self._supervisor.share = other.share
@@ -169,6 +172,7 @@ class Feedback:
             supervisor.in_time()
         planned, before = self._nominal.command(k), self._chambers.sent(k - 1)
         correction, swing, missed = np.zeros_like(planned), 0.0, 0.0
+        wanted = np.zeros_like(planned)
         try:
             # Matrices of some ten rows: more threads only get into other processes' way.
             with _THREADS.limit(limits=1, user_api="blas"):
@@ -179,20 +183,25 @@ class Feedback:
                 missed = self._estimator.missed(known, k)
                 share = supervisor.advance(instant, age, known.strange)
                 if share > 0.0:
-                    correction = share * self._horizon.solve(k, known)
+                    wanted = share * self._horizon.solve(k, known)
+                    seen = round(self._estimator.newest / CONTROL_PERIOD)
+                    shown = self._estimator.at(seen * CONTROL_PERIOD)
+                    self._benefit.see(seen, self._estimator.gap(shown, seen))
+                    correction = self._benefit.share * wanted
         except np.linalg.LinAlgError:
             correction[:] = np.nan
         if not np.isfinite(correction).all():
             supervisor.stop(instant, "inconsistent", np.inf)
-            correction = np.zeros_like(planned)
+            correction = wanted = np.zeros_like(planned)
         air = self._nominal.model.air
         chambers = self._chambers.during(np.array([k * STEPS - 1]))[0]
         self._reaction.follow(planned, self.touch, chambers)
-        wanted = self._reaction.allowed(planned + correction)
-        command: Array = within_limits(wanted[None], air, CONTROL_PERIOD, before)[0][0]
+        allowed = self._reaction.allowed(planned + correction)
+        command: Array = within_limits(allowed[None], air, CONTROL_PERIOD, before)[0][0]
         if self.touch.touched and self._reaction.acts:
             missed = 0.0  # What is in the way keeps the tip away.
         supervisor.sent(instant, command - planned, swing, missed)
+        self._benefit.sent(k, command - planned, wanted)
         self._chambers.send(k, command)
         self._estimator.changed(instant)
         return command
@@ -209,7 +218,7 @@ class Feedback:
         Those after the first are what would follow if nothing new were seen.
         """
         first, corrections = self._horizon.solution
-        corrections = self._supervisor.share * corrections
+        corrections = self._benefit.share * self._supervisor.share * corrections
         if self.touch.touched and self._reaction.acts:
             planned = self._nominal.commands[self._nominal.periods(first + np.arange(_SOON))]
             for ahead, each in enumerate(planned):

@@ -1,0 +1,92 @@
+"""How much of feedback's corrections is worth sending: what they have brought, in hindsight.
+
+A share α of the corrections c that the horizon wants is sent, which has moved the tip by e_α; all
+of them would have moved it by e. The plan alone would have left the measured tip less r̄ less e_α,
+and the share that would have left least of it is
+
+    α = − Σ (tip − r̄ − e_α)·e / (Σ e² + P)        0 ≤ α ≤ 1
+
+over what was seen until now, older instants counting less. e is that of a limb that follows its
+pressures without swinging, since statics are calibrated; what swings is smoothed away on both
+sides. Where a disturbance changes faster than it can be seen and made up for, or corrections bend
+the limb otherwise than the model, they come in the wrong phase, α falls, and the plan is left
+alone. P keeps α at zero until something was seen.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from der_planner.arrays import Array
+from der_planner.control.nominal import Nominal
+from der_planner.model import CONTROL_PERIOD
+
+_SMOOTH = 0.3
+"""Time constant of the two low-passes in front of the sums [s]."""
+_FORGET = 5.0
+"""Time in which what corrections have brought is forgotten [s]."""
+_DOUBT = 0.002
+"""√(P / 1 s), over the limb's length."""
+
+
+class Benefit:
+    """Weighs corrections by what they have brought; see the module.
+
+    Args:
+        nominal: the model's motion under the plan.
+
+    Attributes:
+        share: α.
+    """
+
+    def __init__(self, nominal: Nominal) -> None:
+        self._nominal, inputs = nominal, nominal.model.inputs
+        still = np.eye(2 * inputs) - nominal.transition
+        self._bend = np.linalg.solve(still, nominal.input)[:, :inputs]
+        of = nominal.model.air.pneumatics
+        self._follows = _step(CONTROL_PERIOD, of.delay + of.time_constant)
+        # What corrections that are sent, and all of them, have come to in the chambers: by period.
+        self._pressure = np.zeros((2, inputs))
+        self._held: dict[int, Array] = {}
+        self._smooth = np.zeros((2, 2, 2))
+        self._sums = np.zeros(2)
+        self._prior = (_DOUBT * nominal.model.limb.length) ** 2
+        self._seen = -1
+        self.share = 0.0
+
+    def take_over(self, other: Benefit) -> None:
+        """Begin with what the corrections of another plan of this limb have brought."""
+        self._sums, self.share = other._sums, other.share
+        self._pressure = other._pressure
+
+    def sent(self, k: int, sent: Array, wanted: Array) -> None:
+        """Note the correction that is sent and that which is wanted (M,) [Pa] in a period."""
+        both = np.stack([sent, wanted])
+        self._pressure = self._pressure + self._follows * (both - self._pressure)
+        self._held[k + 1] = self._pressure
+
+    def see(self, k: int, missed: Array) -> None:
+        """Take in the tip less r̄ (2,) [m] as it was seen in control period ``k``."""
+        if k <= self._seen or k not in self._held:
+            return
+        passed = CONTROL_PERIOD * (k - self._seen if self._seen >= 0 else 1)
+        self._seen, pressure = k, self._held[k]
+        self._held = {j: held for j, held in self._held.items() if j > k}
+        row = self._nominal.periods(k)
+        jacobian = self._nominal.kinematics.tip_jacobians(self._nominal.bend[row])
+        moved = pressure @ (jacobian @ self._bend[row]).T
+        now = np.stack([missed - moved[0], moved[1]])
+        for stage in range(len(self._smooth)):
+            self._smooth[stage] += _step(passed, _SMOOTH) * (now - self._smooth[stage])
+            now = self._smooth[stage]
+        alone, wanted = now
+        fresh = np.array([-alone @ wanted, wanted @ wanted])
+        self._sums = self._sums + passed * fresh - _step(passed, _FORGET) * self._sums
+        self.share = min(max(float(self._sums[0] / (self._sums[1] + self._prior)), 0.0), 1.0)
+
+
+def _step(passed: float, time: float) -> float:
+    """Return the share of a step that a low-pass has followed after a time [s]."""
+    return 1.0 - math.exp(-passed / time)
