@@ -86,7 +86,7 @@ class Feedback:
     @property
     def share(self) -> float:
         """Share of the corrections that is sent, 0 … 1."""
-        return self._supervisor.share
+        return self._benefit.share * self._supervisor.share
 
     @property
     def touch(self) -> Touch:
@@ -218,7 +218,7 @@ class Feedback:
         Those after the first are what would follow if nothing new were seen.
         """
         first, corrections = self._horizon.solution
-        corrections = self._benefit.share * self._supervisor.share * corrections
+        corrections = self.share * corrections
         if self.touch.touched and self._reaction.acts:
             planned = self._nominal.commands[self._nominal.periods(first + np.arange(_SOON))]
             for ahead, each in enumerate(planned):

@@ -199,7 +199,8 @@ def prepare(
     if valid.mean() < least:
         raise LogError(
             f"the tags were seen in {100 * valid.mean():.0f} % of the log only, "
-            f"{100 * least:.0f} % are needed: check light, focus and the tag map"
+            f"{100 * least:.0f} % are needed: check light, focus and the tag map; rows more than "
+            f"{longest_gap:g} s apart leave a gap (--longest-gap)"
         )
     if valid.mean() < 0.98:
         warnings.append(f"tags lost in {100 * (1 - valid.mean()):.1f} % of the log")
