@@ -18,6 +18,7 @@ from der_planner.control.lockstep import Sensors, play
 from der_planner.identification import CalibrationLog, fit
 from der_planner.identification.excitation import calibration_run
 from der_planner.limb import Limb
+from der_planner.model import Model
 from der_planner.planning import Motion, plan
 
 try:
@@ -155,6 +156,9 @@ assert min(errors[1:]) < errors[0]
 for label, run in (("learned", played), ("feedback", corrected), ("open loop", play(made, Arm()))):
     plt.plot(*run.tip.T, label=label)
 plt.plot(*made.tip_reference.T, "k--", lw=1, label="asked for")
+middle, body = len(made.time) // 2, Model.of(limb).kinematics
+plt.plot(*made.curve(middle).T, "0.7", lw=4, label="planned limb")
+plt.plot(*body.curve(corrected.bend_angles[middle]).T, "0.2", label="limb with feedback")
 plt.axis("equal")
 plt.xlabel("x [m]")
 plt.ylabel("y [m]")

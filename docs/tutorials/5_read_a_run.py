@@ -14,6 +14,7 @@ import numpy as np
 
 from der_planner.limb import Limb
 from der_planner.model import Material, Model
+from der_planner.planning import Motion, plan
 from der_planner.results import evaluate_run, format_table, load_run, summarise
 
 folder = Path("docs/tutorials") if Path("docs/tutorials").is_dir() else Path()
@@ -76,12 +77,14 @@ print("friction and creep take up to", np.abs(taken).max(axis=0).round(), "Pa")
 # --------------------
 # Shapes come from bend angles: here the limb as filmed beside the limb as planned, at four instants.
 
+told = run.description
+planned = plan(limb, Motion.named(told.motion, told.amplitude, told.period, told.cycles))
 body = Model.of(limb).kinematics
 plt.figure()
 for instant in np.linspace(5, 30, 4):
-    filmed = bend[np.searchsorted(time, instant)]
-    plt.plot(*body.curve(filmed).T, color="C1")
-    plt.plot(*reference[np.searchsorted(run.tip.time, instant)], "k+", ms=10)
+    plt.plot(*planned.curve(np.searchsorted(planned.time, instant)).T, "C0--", label="planned")
+    plt.plot(*body.curve(bend[np.searchsorted(time, instant)]).T, "C1", label="filmed")
+plt.legend(*(each[:2] for each in plt.gca().get_legend_handles_labels()))
 plt.axis("equal")
 plt.xlabel("x [m]")
 plt.ylabel("y [m]")
