@@ -220,15 +220,15 @@ class Obstacles:
         moved, change = np.zeros((len(curves), 2)), np.zeros(bend_angles.shape[1])
         for k, (curve, bend) in enumerate(zip(curves, bend_angles, strict=True)):
             near = [self.nearest(each, curve[None]) for each in self.items]
+            if all(found.clearance >= 0.0 for found in near):
+                change = np.zeros_like(change)
+                continue
             least = np.array(
                 [
                     _MARGIN - each.allowed_force * _slack(model, bend, found)
                     for each, found in zip(self.items, near, strict=True)
                 ]
             )
-            if all(found.clearance >= 0.0 for found in near):
-                change = np.zeros_like(change)
-                continue
             change = self._aside(model, curve, bend, least, change)
             moved[k] = model.kinematics.tip(bend + change) - model.kinematics.tip(bend)
         smooth: Array = gaussian_filter1d(moved, _SMOOTHED, axis=0, mode="nearest")
