@@ -6,11 +6,15 @@ From what the tip should do to the pressures that make it, and what stands in th
 pressure, and how fast air flows.
 """
 
+from pathlib import Path
+
 import matplotlib.pyplot as plt
 import numpy as np
 
 from der_planner.limb import Limb
+from der_planner.model import Model
 from der_planner.planning import Motion, UnreachableError, plan
+from der_planner.twin.offline import play
 
 limb = Limb.default()
 print(f"{limb.segment_count} segments, {100 * limb.length:.1f} cm")
@@ -76,6 +80,26 @@ for period in (20.0, 6.0, 3.0):
     )
     assert largest <= limb.pneumatics.pressure_limit
 
+# %%
+# Does the limb do it?
+# --------------------
+# The twin of seed 3 is a limb of another rod library, whose limb file comes from a calibration run. The
+# same path is planned for that limb and played on it: the planned limb beside the one that moves.
+
+folder = Path("docs/tutorials") if Path("docs/tutorials").is_dir() else Path()
+known = Limb.from_yaml(folder / "seed_3.yaml")
+ours = plan(known, Motion.from_tip_path(None, square, name="square", nearest=True))
+moved = play(ours.time, ours.differential_pressure, seed=3)
+error = np.linalg.norm(moved.tip - ours.tip_reference, axis=1).mean()
+print(f"mean error of the tip {1e3 * error:.2f} mm")
+
+plt.figure()
+for index in np.linspace(0, len(ours.time) - 1, 5).astype(int):
+    plt.plot(*ours.curve(index).T, "C0--", label="planned")
+    plt.plot(*Model.of(known).kinematics.curve(moved.bend_angles[index]).T, "C1", label="twin")
+plt.plot(*moved.tip.T, "C1", lw=1)
+plt.legend(*(each[:2] for each in plt.gca().get_legend_handles_labels()))
+plt.axis("equal")
 plt.show()
 
 # %%

@@ -13,6 +13,7 @@ import numpy as np
 from der_planner.identification import check, fit, predict, record_twin
 from der_planner.identification.excitation import calibration_run
 from der_planner.limb import Limb
+from der_planner.model import Model
 
 SEED = 3  # each seed is another limb
 
@@ -56,6 +57,14 @@ for index, axis in enumerate(axes):
 axes[0].legend(loc="upper right")
 axes[1].set_xlabel("time [s]")
 figure.tight_layout()
+
+body = Model.of(limb).kinematics
+plt.figure()
+for row in np.linspace(0, len(even.time) - 1, 8).astype(int):
+    plt.plot(*body.curve(even.bend_angles[row]).T, "0.6", lw=3, label="measured")
+    plt.plot(*body.curve(known.bend_angles[row]).T, "C1", label="predicted")
+plt.legend(*(each[:2] for each in plt.gca().get_legend_handles_labels()))
+plt.axis("equal")
 
 # %%
 # Check
