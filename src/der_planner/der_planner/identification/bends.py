@@ -64,7 +64,7 @@ BENDS_ON = np.deg2rad(2.0)
 """Rate of the bend that pressures ask for from which on friction does not turn round [rad/s]."""
 SOFTNESS = 3.0
 """Errors beyond this multiple of the usual one count less than their square."""
-ROUGH = 1e-2
+ROUGH = 3e-2
 """Relative change of the sum of squares at which a search ends whose weights are not known yet."""
 SAME_WEIGHT = math.log(1.25)
 """Change of the logarithm of an error up to which a search need not be repeated."""

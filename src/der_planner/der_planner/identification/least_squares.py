@@ -23,7 +23,7 @@ Rows = tuple[Array, Array]
 NOT_FOLLOWED = 100.0
 """Weighted residual of every row where the data function has no answer, which drives the search
 back to a shorter step."""
-TOLERANCE = 1e-4
+TOLERANCE = 1e-3
 """Relative change of the sum of squares at which a search ends: its unknowns then change by less
 than their uncertainty."""
 MOST_EVALUATIONS = 25
