@@ -47,12 +47,12 @@ RODS = """
 task: model
 factors:
   motion: same_direction
-  period: [1, 1.5, 2]
+  period: [1, 2]
   cycles: 1
   amplitude: [0.3, 1.9]
   method: projected
   error.moment_gain: {low: -0.1, high: 0.1}
-draw: {method: random, count: 8}
+draw: {method: random, count: 4}
 keep: [mean_error_m, max_error_m]
 plots:
   - {name: errors, kind: lines, x: period, y: mean_error_m, panels: amplitude}
@@ -100,7 +100,7 @@ def test_one_or_two_workers_and_rows_that_fail(tmp_path, monkeypatch):
 
 
 class Breaking(Progress):
-    """Ends a worker process when two rows are there, and the whole cluster when five are."""
+    """Ends a worker process when two rows are there, and the whole cluster when four are."""
 
     def __init__(self, cluster: LocalCluster) -> None:
         super().__init__()
@@ -110,19 +110,19 @@ class Breaking(Progress):
         if done >= 2 and self._doomed:
             os.kill(self._doomed, signal.SIGKILL)
             self._doomed = 0
-        if done >= 5:
+        if done >= 4:
             self._cluster.close()
 
 
 def test_a_cluster_that_breaks(tmp_path):
     """A worker is killed, then the scheduler is gone: nothing is lost, nothing is done again."""
-    study, out = Study.read(write(tmp_path, TWINS.format(count=14))), tmp_path / "out"
+    study, out = Study.read(write(tmp_path, TWINS.format(count=9))), tmp_path / "out"
     with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
         settings = PlaySettings(out, cluster.scheduler_address)
         with pytest.raises(StudyError, match=r"scheduler is gone.*same command goes on from here"):
             conduct(study, settings, Breaking(cluster))
     kept = (out / "rows.jsonl").read_text()
-    assert 5 <= len(by_key(out)) < len(study.rows)
+    assert 4 <= len(by_key(out)) < len(study.rows)
     found = conduct(study, PlaySettings(out), Progress())
     assert list(found) == [row.key for row in study.rows]
     assert {record["error"] for record in found.values()} == {None}
