@@ -42,7 +42,7 @@ def test_a_path_is_drawn_and_reported(tmp_path: Path):
 @pytest.mark.slow
 def test_feedback_stands_beside_the_open_loop(tmp_path: Path):
     arguments = ["--offline", "--no-calibration", "--models", "der", "--feedback", "--seed", "3"]
-    arguments += ["--period", "6", "--cycles", "1"]
+    arguments += ["--period", "12", "--cycles", "1"]
     run(parse([*arguments, "--out", str(tmp_path)]))
     runs = json.loads((tmp_path / "results.json").read_text())["runs"]
     found = {result["method"]: result for result in runs}

@@ -4,9 +4,11 @@ A share α of the corrections c that the horizon wants is sent, which has moved 
 of them would have moved it by e. The plan alone would have left the measured tip less r̄ less e_α,
 and the share that would have left least of it is
 
-    α = − Σ (tip − r̄ − e_α)·e / (Σ e² + P)        0 ≤ α ≤ 1
+    α = − Σ (tip − r̄ − e_α)·e / (Σ e² + P)
 
-over what was seen until now, older instants counting less. e is that of a limb that follows its
+over what was seen until now, older instants counting less. As far as that may be chance, by what
+such a share would have left and the number of instants that are independent, it is taken off: α is
+less by some of its standard deviations, and within 0 … 1. e is that of a limb that follows its
 pressures without swinging, since statics are calibrated; what swings is smoothed away on both
 sides. Where a disturbance changes faster than it can be seen and made up for, or corrections bend
 the limb otherwise than the model, they come in the wrong phase, α falls, and the plan is left
@@ -25,8 +27,17 @@ from der_planner.model import CONTROL_PERIOD
 
 _SMOOTH = 0.3
 """Time constant of the two low-passes in front of the sums [s]."""
-_FORGET = 5.0
+_FORGET = 10.0
 """Time in which what corrections have brought is forgotten [s]."""
+_INDEPENDENT = 0.8
+"""Time after which an instant says something new of the share [s]."""
+_DEVIATIONS = 1.5
+"""Number of its standard deviations that are taken off the share."""
+_QUICK = 1.0
+"""Root mean square rate of a motion, over that of its bend, from which on nothing is trusted before
+it was seen [1/s]."""
+_TRUST, _TRUSTED = 0.008, 10.0
+"""What the slowest motion begins with: √(Σ e² / 1 s) over the length, and for how long [s]."""
 _DOUBT = 0.002
 """√(P / 1 s), over the limb's length."""
 
@@ -51,7 +62,12 @@ class Benefit:
         self._pressure = np.zeros((2, inputs))
         self._held: dict[int, Array] = {}
         self._smooth = np.zeros((2, 2, 2))
-        self._sums = np.zeros(2)
+        # Of −alone·wanted, wanted², alone² and 1 over time: what is slow is trusted at first.
+        moved = nominal.bend - nominal.bend.mean(axis=0)
+        rates = np.gradient(nominal.bend, CONTROL_PERIOD, axis=0)
+        quick = float(np.sum(rates**2) / max(np.sum(moved**2), 1e-12)) / _QUICK**2
+        trust, worth = max(0.0, 1.0 - quick), (_TRUST * nominal.model.limb.length) ** 2
+        self._sums = trust * np.array([worth, worth, worth, _TRUSTED])
         self._prior = (_DOUBT * nominal.model.limb.length) ** 2
         self._seen = -1
         self.share = 0.0
@@ -82,9 +98,14 @@ class Benefit:
             self._smooth[stage] += _step(passed, _SMOOTH) * (now - self._smooth[stage])
             now = self._smooth[stage]
         alone, wanted = now
-        fresh = np.array([-alone @ wanted, wanted @ wanted])
+        fresh = np.array([-alone @ wanted, wanted @ wanted, alone @ alone, 1.0])
         self._sums = self._sums + passed * fresh - _step(passed, _FORGET) * self._sums
-        self.share = min(max(float(self._sums[0] / (self._sums[1] + self._prior)), 0.0), 1.0)
+        brought, asked, lacked, watched = self._sums
+        share = brought / (asked + self._prior)
+        doubt = max(lacked - share * brought, 0.0) / (asked + self._prior)
+        others = max(watched / _INDEPENDENT - 1.0, 1e-9)
+        share -= _DEVIATIONS * math.sqrt(doubt / others)
+        self.share = min(max(float(share), 0.0), 1.0)
 
 
 def _step(passed: float, time: float) -> float:

@@ -49,7 +49,8 @@ class Feedback:
 
     Args:
         plan: what is played; its limb, reference and commands are used.
-        reaction: to something that touches the limb: "warn", "hold", "yield" or "vent".
+        reaction: to something that touches the limb: "warn", "hold", "yield" or "vent". A limb that
+            was never calibrated is not known well enough to yield: it warns.
         force_limit: force that is allowed then, with "yield" [N]; None: none more than there is.
 
     Attributes:
@@ -57,10 +58,12 @@ class Feedback:
     """
 
     def __init__(
-        self, plan: Plan, reaction: Kind = "warn", force_limit: float | None = None
+        self, plan: Plan, reaction: Kind = "yield", force_limit: float | None = None
     ) -> None:
         self.plan = plan
         authority = _AUTHORITY * plan.limb.pneumatics.pressure_limit
+        if reaction == "yield" and not plan.limb.calibrated.differential_pressure:
+            reaction = "warn"
         length = sum(segment.length for segment in plan.limb.segments)
         self._supervisor = Supervisor(authority, length)
         with _THREADS.limit(limits=1, user_api="blas"):
@@ -196,7 +199,7 @@ class Feedback:
         air = self._nominal.model.air
         chambers = self._chambers.during(np.array([k * STEPS - 1]))[0]
         self._reaction.follow(planned, self.touch, chambers)
-        allowed = self._reaction.allowed(planned + correction)
+        allowed = self._reaction.allowed(planned + self._reaction.corrected(correction))
         command: Array = within_limits(allowed[None], air, CONTROL_PERIOD, before)[0][0]
         if self.touch.touched and self._reaction.acts:
             missed = 0.0  # What is in the way keeps the tip away.
@@ -218,7 +221,7 @@ class Feedback:
         Those after the first are what would follow if nothing new were seen.
         """
         first, corrections = self._horizon.solution
-        corrections = self.share * corrections
+        corrections = self._reaction.mixed(self.share * corrections)
         if self.touch.touched and self._reaction.acts:
             planned = self._nominal.commands[self._nominal.periods(first + np.arange(_SOON))]
             for ahead, each in enumerate(planned):

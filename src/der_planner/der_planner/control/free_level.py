@@ -1,9 +1,10 @@
 """What the model lacks of a limb that nothing touches, by the estimator: the free level.
 
 Gains, friction and the camera are a little wrong. What is lacking (`Lacking.value`) is then
-c + γ·w + e and some noise, with the pressures w of all segments and an e that wanders and is
-forgotten. It is less known where friction turns round or the limb hardly moves: what sticks takes
-any pressure up to its friction. c, γ, e and noise are learned while nothing is touched.
+c + γ·w + κ·θ + e and some noise, with the pressures w of all segments, their bend angles θ where
+gravity bends the limb as well, and an e that wanders and is forgotten. It is less known where
+friction turns round or the limb hardly moves: what sticks takes any pressure up to its friction. c,
+γ, κ, e and noise are learned while nothing is touched.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import numpy as np
 from der_planner.arrays import Array
 from der_planner.control.knowledge import Knowledge
 from der_planner.control.nominal import Nominal
+from der_planner.limb import Limb
 
 _FREE_LEVEL = 250.0, 2e-3
 """Standard deviations of c, of a limb that nothing is known of yet [Pa], and of the tip [m]."""
@@ -22,6 +24,8 @@ _FREE_NOISE = 110.0, 2e-4
 """The same of e and noise together."""
 _FREE_GAIN, _FREE_COUPLING, _FREE_TIP = 0.15, 0.05, 1e-7
 """The same of γ by a segment's own pressure and by that of another, and of the tip [m/Pa]."""
+_FREE_STIFFNESS, _FREE_TIP_BENT = 0.25, 1e-3
+"""The same of κ, over the segment's stiffness, and of the tip [m/rad]."""
 _WANDERS = 0.5
 """Share of e in its variance and the noise's."""
 _FORGOTTEN = 1.5
@@ -31,7 +35,7 @@ _FIRST_WORTH = 10.0
 _WATCHED = 600.0
 """Time in which noise that was watched is forgotten [s]."""
 _SAYS_NEW = 0.5
-"""Time after which noise says something new of c, γ and e [s]."""
+"""Time after which noise says something new of c, γ, κ and e [s]."""
 _FRICTION_WRONG = 0.75
 """Standard deviation of friction from its model where it turns round, over its largest."""
 _FRICTION_SLIDING = 0.02
@@ -83,37 +87,42 @@ class Lacking:
 
 
 class FreeLevel:
-    """What the model lacks of a limb that nothing touches: c + γ·w + e, and noise.
+    """What the model lacks of a limb that nothing touches: c + γ·w + κ·θ + e, and noise.
 
     Args:
-        inputs: M segments.
+        limb: of M segments.
 
     Attributes:
         noise: (M + 2,) variance of e and noise together.
         payload: at the tip, beside what was planned [kg].
     """
 
-    def __init__(self, inputs: int) -> None:
+    def __init__(self, limb: Limb) -> None:
         self.payload = 0.0
+        inputs = limb.segment_count
         level, noise = (np.repeat(each, [inputs, 2]) for each in (_FREE_LEVEL, _FREE_NOISE))
         slope = np.full((inputs + 2, inputs), _FREE_TIP)
         slope[:inputs] = _FREE_COUPLING + (_FREE_GAIN - _FREE_COUPLING) * np.eye(inputs)
-        known = np.column_stack([level, slope, np.zeros(len(level))])
+        bent = np.zeros_like(slope)
+        if limb.weighs_in_plane:
+            stiffness = [s.bending_stiffness / s.length / s.moment_gain for s in limb.segments]
+            bent[:inputs], bent[inputs:] = _FREE_STIFFNESS * np.diag(stiffness), _FREE_TIP_BENT
+        known = np.column_stack([level, slope, bent, np.zeros(len(level))])
         self._mean = np.zeros_like(known)
         self._covariance = known[:, :, None] ** 2 * np.eye(known.shape[1])
         self.noise = noise**2
         self._covariance[:, -1, -1] = _WANDERS * self.noise
         self._worth = _FIRST_WORTH
 
-    def expected(self, effective: Array, ahead: float = 0.0) -> tuple[Array, Array]:
+    def expected(self, lacking: Lacking, ahead: float = 0.0) -> tuple[Array, Array]:
         """Return mean and variance (M + 2,), noise and all.
 
         Args:
-            effective: (M,) pressure [Pa].
+            lacking: tells pressures and bend angles.
             ahead: time since something was learned [s].
         """
         kept = np.exp(-ahead / _FORGOTTEN)
-        by = np.concatenate([[1.0], effective, [kept]])
+        by = np.concatenate([[1.0], lacking.effective, lacking.bend_angles, [kept]])
         left = _WANDERS * (1.0 - kept**2) + 1.0 - _WANDERS
         return self._mean @ by, by @ self._covariance @ by + left * self.noise
 
@@ -131,7 +140,8 @@ class FreeLevel:
         self._covariance[:, -1] *= kept
         self._covariance[:, :, -1] *= kept
         self._covariance[:, -1, -1] += _WANDERS * (1.0 - kept**2) * self.noise
-        by, other = np.concatenate([[1.0], lacking.effective, [1.0]]), np.diag(lacking.covariance)
+        by = np.concatenate([[1.0], lacking.effective, lacking.bend_angles, [1.0]])
+        other = np.diag(lacking.covariance)
         seen = self._covariance @ by
         white = (1.0 - _WANDERS) * self.noise
         old = _SAYS_NEW / duration * (white + other)

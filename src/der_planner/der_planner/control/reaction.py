@@ -4,9 +4,11 @@ A touch is worth an effective pressure ℓ per segment (`Touch.pressure`): bendi
 raises the force. A change δu of the pressures in the chambers does so as far as −ℓ·δu > 0. While
 something is touched, `yield` gives no command u with −ℓ·u above the least that the plan has asked
 for and the chambers have held since: what the plan and its corrections want is moved to the nearest
-command on that side. What corrections pressed before the touch was noticed is taken back, the limb
-retreats as the plan does, does not follow when the plan presses again, and is free once the touch
-has ended. With a limit in N the bound is where the force would reach it: against something
+command on that side. From before a touch is sure, corrections stay what they were, lest they press
+by another segment. What
+corrections pressed before the touch was noticed is taken back, the limb retreats as the plan does,
+does not follow when the plan presses again, and is free once the touch has ended; corrections then
+come back slowly. With a limit in N the bound is where the force would reach it: against something
 that does not move, pressures raise the force at a place with compliance C_p by
 −f̂ᵀ (∂p/∂u) δu / (f̂ᵀ C_p f̂).
 """
@@ -20,11 +22,15 @@ import numpy as np
 
 from der_planner.arrays import Array
 from der_planner.control.touch import Touch
-from der_planner.model import RodModel
+from der_planner.model import CONTROL_PERIOD, RodModel
 from der_planner.model.compliance import compliance
 
 Kind = Literal["warn", "hold", "yield", "vent"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
+_SUSPECTED = 0.6
+"""`Touch.distance` from which on corrections stay what they were."""
+_RETURN = 1.0
+"""Time in which corrections come back once a touch has ended [s]."""
 _SMALLEST = 1e-9
 """A pressure below this gives no direction [Pa]."""
 
@@ -50,6 +56,8 @@ class Reaction:
         self._model = model
         self._held: Array | None = None
         self._bound = np.zeros(0), 0.0
+        self._suspected = False
+        self._free, self._kept = 1.0, np.zeros(model.inputs)
 
     @property
     def acts(self) -> bool:
@@ -69,6 +77,7 @@ class Reaction:
             touch: as it is known now.
             chambers: (M,) differential pressures in them now [Pa].
         """
+        self._suspected = self.acts and touch.distance > _SUSPECTED and not touch.weighed
         if touch.weighed or not (touch.touched and self.acts):
             self._held = None
             return
@@ -82,6 +91,15 @@ class Reaction:
         if self.limit is not None and np.isfinite([touch.place, *touch.force]).all():
             self._bound = self._limited(touch, chambers, self.limit)
 
+    def corrected(self, wanted: Array) -> Array:
+        """Return the correction (M,) [Pa] of this control period in place of a wanted one."""
+        if self._held is not None or self._suspected:
+            self._free = 0.0
+        else:
+            self._free = min(1.0, self._free + CONTROL_PERIOD / _RETURN)
+            self._kept = wanted if self._free == 1.0 else self._kept
+        return self.mixed(wanted)
+
     def allowed(self, wanted: Array) -> Array:
         """Return the command (M,) [Pa] in place of a wanted one."""
         if self._held is None:
@@ -92,6 +110,10 @@ class Reaction:
         square = max(float(harder @ harder), _SMALLEST**2)
         return wanted - harder * (max(0.0, float(harder @ wanted) - bound) / square)
 
+    def mixed(self, wanted: Array) -> Array:
+        """Return wanted corrections (…, M) [Pa] as far as they have come back after a touch."""
+        return self._kept + self._free * (wanted - self._kept)
+
     def _limited(self, touch: Touch, chambers: Array, limit: float) -> tuple[Array, float]:
         """Return how pressures raise the force (M,) [N/Pa], and how far that may go [N]."""
         limp = compliance(self._model, touch.bend_angles, [touch.place])
@@ -99,4 +121,6 @@ class Reaction:
         along = touch.force / size
         slack = float(along @ limp.place[0] @ along)
         harder = -(along @ limp.place_by_pressure[0]) / slack
-        return harder, float(harder @ chambers) + limit - size
+        # The force may be larger than told by its standard deviation.
+        most = size + math.sqrt(float(along @ touch.force_covariance @ along))
+        return harder, float(harder @ chambers) + limit - most

@@ -23,6 +23,7 @@ gravity has no part in the plane, a payload cannot be told.
 
 from __future__ import annotations
 
+import copy
 from collections import deque
 from dataclasses import dataclass, replace
 
@@ -43,6 +44,11 @@ _RELEASED = 0.5
 """Share of the threshold below which a touch ends."""
 _LEARNED_AFTER = 0.4
 """What is over within that time is learned, touch or not: contact that begins slowly is not [s]."""
+_TOUCHED_FORGETS = 0.1
+"""Share of time that counts for forgetting the free level while something touches the limb: a touch
+ends when the limb is back there."""
+_EARLIER = 4
+"""Number of touches whose free levels are kept."""
 _LONGEST = 1.0
 """Time between two pictures of which something is learned, at most [s]."""
 _LARGEST_FORCE = 2.0
@@ -127,7 +133,7 @@ class TouchSense:
     def __init__(self, model: RodModel, free: FreeLevel | None = None) -> None:
         self._model = model
         self._has_weight = float(np.hypot(*model.limb.gravity[:2])) > _LEAST_GRAVITY
-        self.free = free or FreeLevel(model.inputs)
+        self.free = free or FreeLevel(model.limb)
         limb = model.limb
         self._places = np.linspace(limb.base_length, limb.length, _PLACES + 1)[1:]
         self.threshold = _chance(_CORRELATED / _HOUR, model.inputs + 2)
@@ -135,6 +141,7 @@ class TouchSense:
         self._recent: deque[tuple[Lacking, float, Array, Array]] = deque()
         self._weighed: list[tuple[float, float, bool]] = []
         self._learned = self._calm = -np.inf
+        self._earlier: list[tuple[FreeLevel, float]] = []
 
     def feel(self, time: float, nominal: Nominal, known: Knowledge) -> Touch:
         """Return what a newer state of the estimator says of a touch.
@@ -151,26 +158,24 @@ class TouchSense:
     def look(self, lacking: Lacking) -> Touch:
         """Return what a newer instant says of a touch."""
         before = self.newest
-        mean, variance = self.free.expected(lacking.effective, lacking.time - self._learned)
-        weight = self._weight_effect(lacking.bend_angles)
-        lacking = replace(lacking, value=lacking.value - self.free.payload * weight)
-        value, noise = lacking.value - mean, lacking.covariance + np.diag(variance)
-        distance = float(value @ np.linalg.solve(noise, value)) / self.threshold
+        away, variance, distance = self._away(lacking, self.free, self._learned)
         touched = distance > (_RELEASED if before.touched else 1.0)
+        if touched and not before.touched:
+            touched = not self._lets_go(lacking)
+            away, variance, distance = self._away(lacking, self.free, self._learned)
         if distance < _RELEASED:
             self._calm = lacking.time
         if 0.0 < lacking.time - before.time < _LONGEST:
-            self._recent.append((lacking, lacking.time - before.time, value, variance))
+            self._recent.append((lacking, lacking.time - before.time, away.value, variance))
         if lacking.time - self._calm > _LEARNED_AFTER:
             self._recent.clear()
-        away = replace(lacking, value=value)
         since = before.since if before.touched else lacking.time
         told = weighed = False
         if touched and self._has_weight:
-            told, weighed = self._weighs(away, noise, weight, lacking.time - since)
+            told, weighed = self._weighs(away, lacking.time - since)
         payload = self.free.payload
         if touched and not told:
-            found = locate(self._model, away, noise, self._places)
+            found = locate(self._model, away, self._places)
             said = found.said + (", or a payload" if weighed else "")
             found = replace(found, since=since, distance=distance, weighed=weighed, said=said)
         else:
@@ -183,6 +188,42 @@ class TouchSense:
             self.free.learn(*self._recent.popleft())
         return self.newest
 
+    def _away(
+        self, lacking: Lacking, free: FreeLevel, learned: float
+    ) -> tuple[Lacking, Array, float]:
+        """Return what is away from a free level, that level's variance (M + 2,), and the distance.
+
+        Args:
+            lacking: of the model.
+            free: level.
+            learned: when it was learned last [s].
+        """
+        ahead, touch = lacking.time - learned, self.newest
+        if touch.touched:
+            ahead -= (1.0 - _TOUCHED_FORGETS) * (lacking.time - touch.since)
+        mean, variance = free.expected(lacking, ahead)
+        value = lacking.value - mean
+        if free.payload:
+            value -= free.payload * self._weight_effect(lacking.bend_angles)
+        noise = lacking.covariance + np.diag(variance)
+        distance = float(value @ np.linalg.solve(noise, value)) / self.threshold
+        return replace(lacking, value=value, covariance=noise), variance, distance
+
+    def _lets_go(self, lacking: Lacking) -> bool:
+        """Return whether what seems to begin is the end of a touch, and go back to its free level.
+
+        What was left of the force, when it seemed to be over, has been learned meanwhile.
+        """
+        for place, earlier in enumerate(self._earlier):
+            if self._away(lacking, *earlier)[2] < _RELEASED:
+                self.free, self._learned = copy.deepcopy(earlier)
+                del self._earlier[place + 1 :]
+                self._recent.clear()
+                return True
+        self._earlier.append((copy.deepcopy(self.free), self._learned))
+        del self._earlier[:-_EARLIER]
+        return False
+
     def _weight_effect(self, bend_angles: Array) -> Array:
         """Return what the weight of a kilogram at the tip makes the model lack (M + 2,)."""
         if not self._has_weight:
@@ -191,20 +232,19 @@ class TouchSense:
         weight: Array = effect @ np.array(self._model.limb.gravity[:2])
         return weight
 
-    def _weighs(self, away: Lacking, noise: Array, weight: Array, age: float) -> tuple[bool, bool]:
+    def _weighs(self, away: Lacking, age: float) -> tuple[bool, bool]:
         """Return whether what touches is a payload, and whether it may yet turn out to be one.
 
         What is told to be one belongs to the free level.
 
         Args:
-            away: from the free level.
-            noise: covariance of it.
-            weight: see `_weight_effect`.
+            away: from the free level, with the covariance of that.
             age: of the touch [s].
         """
         if age == 0.0:
             self._weighed.clear()
-        inverse = np.linalg.inv(noise + np.diag((_EFFECT_WRONG * away.value) ** 2))
+        weight = self._weight_effect(away.bend_angles)
+        inverse = np.linalg.inv(away.covariance + np.diag((_EFFECT_WRONG * away.value) ** 2))
         pull = float(weight @ inverse @ weight)
         mass = float(weight @ inverse @ away.value) / pull
         left = float(away.value @ inverse @ away.value) - mass**2 * pull
@@ -223,18 +263,17 @@ class TouchSense:
         return told, perhaps
 
 
-def locate(model: RodModel, lacking: Lacking, noise: Array, places: Array) -> Touch:
+def locate(model: RodModel, lacking: Lacking, places: Array) -> Touch:
     """Return the force that explains what the model lacks, and where it acts.
 
     Args:
         model: rod of the limb.
-        lacking: of the model, less the free level.
-        noise: covariance of it (M + 2, M + 2).
+        lacking: of the model, less the free level, with the covariance of that.
         places: (P,) evenly spaced, where the force may act [m].
     """
     axes = _axes(model, lacking.bend_angles, places)
     effect = effects(model, lacking.bend_angles, places) @ axes
-    weight = np.linalg.inv(noise)
+    weight = np.linalg.inv(lacking.covariance)
     seen = np.swapaxes(effect, 1, 2) @ weight
     square, pull = seen @ effect, seen @ lacking.value
     across = pull[:, 1] / (square[:, 1, 1] + 1.0 / _LARGEST_FORCE**2)

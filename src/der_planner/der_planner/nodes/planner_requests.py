@@ -151,8 +151,8 @@ def read_parameters(node: Node) -> PlannerOptions:
             "does not ask for it"
         ),
         reaction=read(
-            "reaction", "warn", "what feedback does where something touches the limb",
-            choices=KINDS
+            "reaction", "yield", "what feedback does where something touches the limb; a limb that "
+            "was never calibrated warns in place of yielding", choices=KINDS
         ),
         force_limit=read(
             "force_limit", 0.0, "force [N] that the reaction 'yield' allows; 0: none more than "
