@@ -101,7 +101,7 @@ def test_echoes_and_warnings_of_a_ctrlp_board_are_no_reset():
     answers = b"".join(
         board.reply(command, reading)
         for command in board.decode(
-            host.start() * 2 + host.setpoint([1e3, 0.0, 0.0, 0.0], 0.0, 1.0)[0]
+            host.start() * 2 + host.setpoint([1e3, 0.0, 0.0, 0.0])[0]
         )
     )
     events = host.decode(answers + b"_UNREC: Unrecognized Command\n")
