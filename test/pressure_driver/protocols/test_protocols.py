@@ -79,9 +79,7 @@ def test_ezloop_bytes():
 
 def test_ctrlp_bytes():
     host = host_protocol("ctrlp")
-    assert host.setpoint([7500.0, 0.0, 0.0, 20.0])[0] == (
-        b"SET;0.050;7.500;0.000;0.000;0.020\n"
-    )
+    assert host.setpoint([7500.0, 0.0, 0.0, 20.0])[0] == (b"SET;0.050;7.500;0.000;0.000;0.020\n")
     assert host.vent()[0] == b"SET;0.000;0.000;0.000;0.000;0.000\n"
     assert reporting_board("ctrlp").telemetry(READING) == (
         b"12345\t0\t0.00\t0.00\t0.00\t0.00\r\n12345\t1\t0.09\t7.51\t0.04\t0.03\r\n"
@@ -115,9 +113,7 @@ def test_commands_arrive_as_they_were_meant(name, split):
     generator = np.random.default_rng(3) if split else None
     host, board = host_protocol(name), BOARDS[name]()
     wanted = np.random.default_rng(4).uniform(-24_000.0, 24_000.0, (60, 2))
-    stream = host.start() + b"".join(
-        host.setpoint(chamber_gauge(u))[0] for u in wanted
-    )
+    stream = host.start() + b"".join(host.setpoint(chamber_gauge(u))[0] for u in wanted)
     commands = [c for c in decode_all(board, stream, generator) if c.kind == "setpoint"]
     assert len(commands) == len(wanted)
     for command, difference in zip(commands, wanted, strict=True):

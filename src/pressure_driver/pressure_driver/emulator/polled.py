@@ -97,7 +97,9 @@ class FestoBoard(BoardProtocol):
         millibar = (modbus.signed(value) for value in values)
         # Regulators of an MPA terminal that are told less than nothing open wide.
         wild = 0 if self.slots else festo.LARGEST_SETPOINT
-        return tuple(festo.PASCAL_PER_MILLIBAR * (value if value >= 0 else wild) for value in millibar)
+        return tuple(
+            festo.PASCAL_PER_MILLIBAR * (value if value >= 0 else wild) for value in millibar
+        )
 
     def target(self, pressure: Sequence[float], time: float) -> Sequence[float]:
         """Return setpoints of slots that run; the others are vented."""

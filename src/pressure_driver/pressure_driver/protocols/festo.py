@@ -151,7 +151,10 @@ class FestoHost(HostProtocol):
             block = modbus.BLOCK.pack(FIRST_INPUT, INPUTS * self._places)
             self._follow_up = modbus.encode(self._next(), modbus.READ, block)
             return [Echo(frame.transaction)]
-        if frame.function in (modbus.READ | modbus.FAILED, modbus.WRITE | modbus.FAILED) and len(frame.data) == 1:
+        if (
+            frame.function in (modbus.READ | modbus.FAILED, modbus.WRITE | modbus.FAILED)
+            and len(frame.data) == 1
+        ):
             asked = "read" if frame.function == modbus.READ | modbus.FAILED else "write"
             said = f"refused: a {asked} of registers, exception {frame.data[0]}"
             return [BoardFailure(f"{said}; look at 'terminal' and 'segment_count'")]
