@@ -165,9 +165,7 @@ def clamp_lines(clamp: Clamp) -> list[str]:
         f"{1e3 * y_sigma:.1f} mm, turned by {np.degrees(turn):.1f} ± {np.degrees(turn_sigma):.1f}°"
     ]
     if is_off(clamp):
-        lines.append(
-            "warning: limb_base is not at the clamp: the map beside the rig file has it there"
-        )
+        lines.append("warning: limb_base is not at the clamp: --out writes a map in which it is")
     return lines
 
 
