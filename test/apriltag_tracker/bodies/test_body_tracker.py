@@ -115,7 +115,13 @@ def test_the_base_follows_bodies_of_the_table_that_move_together(bodies, swing):
     assert np.abs(errors(tips[-20:], found[-20:])).max() < 1e-3
 
 
-def test_points_on_a_line_tell_no_frame():
+def test_a_frame_is_found_from_points_that_are_not_on_a_line():
+    points = np.random.default_rng(2).normal(size=(4, 3))
+    turned = points @ np.roll(np.eye(3), 1, axis=0) + [1.0, 2.0, 3.0]
+    frame, left = fit_frame(points, turned)
+    assert left < 1e-12
+    assert np.allclose(frame.of(points), turned)
+    assert np.isclose(np.linalg.det(frame.rotation), 1.0)
     line = np.outer(np.arange(4.0), [1.0, 2.0, 0.5])
     assert fit_frame(line, line) is None
 
@@ -160,11 +166,20 @@ def test_poses_that_come_one_by_one_become_frames(assembler):
     assert assembler.unknown == {"stranger": 1}
 
 
-def test_a_body_that_is_lost_holds_up_one_frame_and_comes_back(assembler):
-    told = stamps_of(assembler, "a 0", "b 0", "a 10", "b 10", "a 20", "b 20")
-    assert told == [[], [], [0], [10], [], [20]]
-    told = stamps_of(assembler, "c 20", "a 30", "b 30", "c 30")
-    assert told == [[], [], [], [30]]
+def test_bodies_may_be_a_frame_behind_each_other(assembler):
+    told = stamps_of(assembler, "a 0", "a 10", "b 0", "c 0", "b 10", "a 20", "c 10", "b 20", "c 20")
+    assert told == [[], [], [], [0], [], [], [10], [], [20]]
+
+
+def test_a_body_that_is_lost_holds_up_frames_and_comes_back(assembler):
+    # One that misses a frame is known to do so as soon as the next frame is whole.
+    told = stamps_of(assembler, "a 0", "b 0", "a 10", "b 10", "c 10")
+    assert told[-1] == [0, 10]
+    # One that is gone is waited for until two more frames have begun.
+    told = stamps_of(assembler, "a 20", "b 20", "a 30", "b 30", "a 40", "b 40", "a 50", "b 50")
+    assert told == [[], [], [], [], [20], [30, 40], [], [50]]
+    told = stamps_of(assembler, "c 50", "a 60", "b 60", "c 60")
+    assert told == [[], [], [], [60]]
 
 
 def test_a_clock_that_was_set_back_begins_anew(assembler):

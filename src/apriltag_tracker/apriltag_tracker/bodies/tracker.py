@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
@@ -22,6 +23,8 @@ from apriltag_tracker.pose.shape import PlanarTag, centreline_pose
 
 Array = NDArray[np.float64]
 
+_OPEN_FRAMES = 2
+"""A body that is missing is waited for until so many later frames have begun."""
 _FROZEN_FRAMES = 3
 """A body whose pose has been the very same for so many frames while others moved is lost."""
 _CLOCK_SET = 1_000_000_000
@@ -45,7 +48,8 @@ class PoseFrame(NamedTuple):
 class FrameAssembler:
     """Puts poses that come one body at a time together to frames.
 
-    A frame is complete when all bodies have come that came lately, or when the next one begins.
+    A frame is complete when all bodies have come that came lately. Messages of one body keep their
+    order, those of different bodies may not: a few frames are open at a time.
 
     Args:
         bodies: the body map.
@@ -55,14 +59,11 @@ class FrameAssembler:
     def __init__(self, bodies: BodyMap, tolerance: int = 1_000_000) -> None:
         self._places = {name: place for place, name in enumerate(bodies.names)}
         self._tolerance = tolerance
-        self._frame, self._told = self._empty(-_CLOCK_SET), True
-        self._expected, self._given = set(self._places.values()), set[int]()
+        self._open: list[tuple[PoseFrame, set[int]]] = []
+        self._closed: int | None = None
+        self._expected = set(self._places.values())
         self.unknown: dict[str, int] = {}
         """Poses of bodies that are not in the map, by name."""
-
-    def _empty(self, stamp: int) -> PoseFrame:
-        count = len(self._places)
-        return PoseFrame(stamp, np.full((count, 3), np.nan), np.full((count, 4), np.nan))
 
     def take(self, name: str, stamp: int, pose: tuple[float, ...]) -> list[PoseFrame]:
         """Take x, y, z and the quaternion x, y, z, w of a body; return the frames that end so."""
@@ -70,21 +71,32 @@ class FrameAssembler:
         if place is None:
             self.unknown[name] = self.unknown.get(name, 0) + 1
             return []
-        ended, ahead = [], stamp - self._frame.stamp
-        if -_CLOCK_SET < ahead < -self._tolerance or (self._told and abs(ahead) <= self._tolerance):
-            # Of a frame that was told already: the next one waits for this body, too.
-            self._expected.add(place)
-            return []
-        if abs(ahead) > self._tolerance:
-            if not self._told:
-                ended, self._expected = [self._frame], self._given
-            self._frame, self._given, self._told = self._empty(stamp), set(), False
-        self._frame.positions[place], self._frame.quaternions[place] = pose[:3], pose[3:]
-        self._given.add(place)
-        if self._given >= self._expected:
-            self._told = True
-            ended.append(self._frame)
-        return ended
+        if self._closed is not None and stamp <= self._closed + self._tolerance:
+            if stamp > self._closed - _CLOCK_SET:
+                # Of a frame that was told already: the next one waits for this body, too.
+                self._expected.add(place)
+                return []
+            self._open, self._closed = [], None
+        at = bisect.bisect(self._open, stamp - self._tolerance - 1, key=lambda each: each[0].stamp)
+        if at == len(self._open) or self._open[at][0].stamp > stamp + self._tolerance:
+            count = len(self._places)
+            frame = PoseFrame(stamp, np.full((count, 3), np.nan), np.full((count, 4), np.nan))
+            self._open.insert(at, (frame, set()))
+        frame, given = self._open[at]
+        frame.positions[place], frame.quaternions[place] = pose[:3], pose[3:]
+        given.add(place)
+        if given >= self._expected:
+            # The bodies that an older one lacks have come with this one.
+            return self._close(at + 1)
+        if len(self._open) > _OPEN_FRAMES:
+            self._expected = set(self._open[0][1])
+            return self._close(1)
+        return []
+
+    def _close(self, count: int) -> list[PoseFrame]:
+        frames = [frame for frame, _ in self._open[:count]]
+        self._open, self._closed = self._open[count:], frames[-1].stamp
+        return frames
 
 
 @dataclass(frozen=True)
