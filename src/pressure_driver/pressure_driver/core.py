@@ -142,11 +142,10 @@ class DriverCore:
         """What the board has said last in plain words."""
         self.clock = RunningClock(2.0 / settings.rate, steady)
         """Counts the seconds of every patience."""
-        protocol.clock = self.clock
+        protocol.clock, protocol.room = self.clock, self._wire_atmosphere
         self.monitor = TelemetryMonitor(protocol, settings)
         self.machine = SafetyMachine(settings, self.monitor, self._conditions)
         self.board = BoardWatch(protocol, settings)
-        self._settings = settings
         self._valves = valves_of(settings.wiring, protocol.chamber_count)
         self._log = log
         self._link_fault = "the serial port is not open"
@@ -268,9 +267,7 @@ class DriverCore:
             return self.board.greeting(now) + self._vent_bytes()
         asked = dict(zip(self._valves, chamber_gauge(self.machine.differential), strict=True))
         data, self._pending_number = self.protocol.setpoint(
-            [asked[valve] for valve in sorted(asked)],
-            self._wire_atmosphere(),
-            self._settings.command_validity,
+            [asked[valve] for valve in sorted(asked)]
         )
         return data
 
@@ -285,13 +282,13 @@ class DriverCore:
 
     def emergency(self) -> bytes:
         """Return the vent command, complete after any half-sent bytes."""
-        return self.protocol.emergency(self._wire_atmosphere())
+        return self.protocol.emergency()
 
     def _wire_atmosphere(self) -> float:
         return self.monitor.rest.mean if self.monitor.rest.known else STANDARD_ATMOSPHERE
 
     def _vent_bytes(self) -> bytes:
-        data, self._pending_number = self.protocol.vent(self._wire_atmosphere())
+        data, self._pending_number = self.protocol.vent()
         return data
 
     def _watch_wall_clock(self, instant: int) -> None:

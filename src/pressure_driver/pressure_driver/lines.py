@@ -12,12 +12,12 @@ import errno
 import fcntl
 import json
 import os
-import re
 import socket
 import struct
 import termios
 import time
 from typing import Any
+from urllib.parse import urlsplit
 
 import serial
 
@@ -32,7 +32,6 @@ CONNECT_TIME = 0.1
 ADVICE = "close the air supply"
 IN_USE = (errno.EAGAIN, errno.EBUSY, errno.EADDRINUSE)
 """Error numbers of a line that another program has."""
-_ADDRESS = re.compile(r"tcp://([^:/]+):(\d{1,5})")
 
 
 class Channel:
@@ -184,10 +183,11 @@ def tcp_address(port: str) -> tuple[str, int]:
     Raises:
         OSError: it is written otherwise.
     """
-    found = _ADDRESS.fullmatch(port)
-    if not found or not 0 < int(found[2]) < 1 << 16:
-        raise OSError(errno.EINVAL, f"'{port}' is no address: write tcp://host:port")
-    return found[1], int(found[2])
+    with contextlib.suppress(ValueError):
+        found = urlsplit(port)
+        if found.hostname and found.port:
+            return found.hostname, found.port
+    raise OSError(errno.EINVAL, f"'{port}' is no address: write tcp://host:port")
 
 
 def may_open(port: str) -> bool:

@@ -17,6 +17,7 @@ from pressure_driver.protocols import NAMES
 
 TERMINALS = ("vtem", "mpa")
 TERMINAL = "valves of a `festo` terminal: a motion terminal, or VPPM regulators"
+DEVICE = "number of a `pneudrive` board, which its address follows from"
 SENSOR_RANGE = "of the sensors of a `pneudrive` board, whose counts are a thousandth of it"
 
 
@@ -70,6 +71,7 @@ class Settings:
         0, "baud", 0, 4_000_000, "0: what the protocol says, 1000000 for `pneudrive`, else 115200"
     )
     terminal: str = _other("vtem", TERMINAL, TERMINALS)
+    device: int = _number(0, "", 0, 3, DEVICE)
     sensor_range: float = _number(689_500.0, "Pa", 1e3, 1e7, SENSOR_RANGE)
     rate: float = _number(20.0, "Hz", 1.0, 100.0, "ticks, on an absolute grid")
     real_time_priority: int = _number(
@@ -160,13 +162,11 @@ class Settings:
         count = 2 * self.segment_count
         try:
             valves = valves_of(self.wiring, count)
-        except ValueError:
-            valves = ()
-        if sorted(valves) != list(range(count)):
+        except ValueError as error:
             raise SettingError(
                 f"parameter 'wiring' is '{self.wiring}': name each of the valves 1 to {count} "
                 "once, in the order of the limb's chambers"
-            )
+            ) from error
         if self.protocol == "ezloop" and any(
             left // 2 != right // 2 for left, right in zip(valves[0::2], valves[1::2], strict=True)
         ):
@@ -194,6 +194,7 @@ class EmulatorSettings:
     protocol: str = _other("ezloop", "language of the board", NAMES)
     baud_rate: int = _number(115_200, "baud", 0, 4_000_000, "pace of the bytes; 0: none")
     terminal: str = _other("vtem", TERMINAL, TERMINALS)
+    device: int = _number(0, "", 0, 3, DEVICE)
     sensor_range: float = _number(689_500.0, "Pa", 1e3, 1e7, SENSOR_RANGE)
     segment_count: int = _number(2, "", 1, 16, "pairs of chambers")
     seed: int = _number(0, "", 0, 2**62, "of sensors, valves and the day's atmosphere")

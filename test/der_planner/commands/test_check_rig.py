@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import numpy as np
 import pytest
 
-from der_planner.commands.check_rig import played_wiring
+from apriltag_tracker.bodies.body_map import BodyMap
+from apriltag_tracker.pose.clamp import Clamp
+from apriltag_tracker.tag_map import TagMap
+from der_planner.commands.check_rig import _move_base, played_wiring
 from der_planner.identification.rig import RigError, RigFinding, ValveFinding
 from pressure_driver.settings import SettingError
+
+CONFIG = Path(__file__).resolve().parents[3] / "src" / "apriltag_tracker" / "config"
 
 
 def found(*moves: tuple[int, int], contradictions: tuple[str, ...] = ()) -> RigFinding:
@@ -40,3 +48,19 @@ def test_what_cannot_be_played_is_refused():
         played_wiring(crossed, {})
     with pytest.raises(RigError, match="wrong port"):
         played_wiring(found((0, 1), (0, 1), (1, 1), (1, -1), contradictions=("wrong port",)), {})
+
+
+@pytest.mark.parametrize("poses", [False, True])
+def test_a_clamp_beside_limb_base_gives_the_tracker_a_map_of_its_own(tmp_path: Path, poses: bool):
+    kind, name = (BodyMap, "bodies.yaml") if poses else (TagMap, "tags.yaml")
+    content = {"poses": {}} if poses else {}
+    _move_base(
+        content,
+        CONFIG / name,
+        Clamp(np.array([0.01, 0.0, 0.0]), np.zeros(3)),
+        tmp_path / "rig.yaml",
+    )
+    (written,) = content["poses"].values() if poses else content["tracker"].values()
+    old, new = kind.from_yaml(CONFIG / name), kind.from_yaml(written)
+    before, after = (each.fixed if poses else each.world for each in (old, new))
+    assert after[0].position[0] == pytest.approx(before[0].position[0] - 0.01)

@@ -56,12 +56,23 @@ def test_a_node_of_another_computer_is_marked_and_keeps_its_parameters_there(tmp
         "apriltag_tracker": "camera-pc"
     }
     (recorder,) = (node for node in nodes if node.executable == "recorder")
-    assert json.loads(recorder.parameters["metadata"])["wiring"] == "2,1,4,3"
+    assert json.loads(recorder.parameters["metadata"])["wiring"] == [1, 0, 3, 2]
     rig.write_text("driver: {host: valve-pc}\n")
     assert Hardware.from_yaml(rig).place == "valve-pc"
     rig.write_text("driver: {host: valve-pc, port: /dev/ttyACM0}\n")
     with pytest.raises(OptionError, match=r"on valve-pc: give its parameters \(port\) there"):
         Hardware.from_yaml(rig)
+
+
+def test_a_rig_file_of_a_twin_needs_no_board_and_no_limb_file(tmp_path: Path):
+    rig = tmp_path / "rig.yaml"
+    rig.write_text("driver: {protocol: native, wiring: '2,1,4,3'}\ntwin: {wiring: [2, 1, 4, 3]}\n")
+    options = parse(["--hardware", str(rig)])
+    nodes = GraphSetup(tmp_path, {}, hardware=options.hardware).nodes("/tmp/board")
+    found = {node.executable: node.parameters for node in nodes}
+    assert found["limb_twin"]["wiring"] == [2, 1, 4, 3]
+    assert found["board_emulator"]["protocol"] == found["pressure_driver"]["protocol"] == "native"
+    assert found["pressure_driver"]["wiring"] == "2,1,4,3"
 
 
 def test_the_twin_has_the_board_that_is_named(tmp_path: Path):

@@ -11,7 +11,6 @@ from der_planner.identification.bends import (
     COLUMN,
     NODES,
     TERMS,
-    BendFit,
     FreeTerms,
     follow,
     predicted,
@@ -19,7 +18,7 @@ from der_planner.identification.bends import (
 )
 from der_planner.identification.excitation import calibration_run, steps, sweep, waves
 from der_planner.identification.lengths import fit_geometry, lengths_of, with_lengths
-from der_planner.identification.log import Prepared, prepare
+from der_planner.identification.log import Prepared
 from der_planner.limb import Limb
 from der_planner.model import RodModel
 
@@ -192,17 +191,19 @@ def test_excitation_stays_inside_its_amplitude_and_excites_each_input_alone():
     np.testing.assert_array_equal(run.differential_pressure[[0, -1]], 0.0)
 
 
-def test_what_is_seen_late_is_told_with_its_deviation(fitted, log):
-    limb, report = fitted
+def test_what_is_seen_late_is_told_and_taken_out_of_the_fit(fitted):
+    _, report = fitted
     late, deviation = report.delay
     assert abs(late) < max(4.0 * deviation, 0.004)
+    assert report.taken_out == 0.0
+    log = synthetic_log(Limb.default()).between(40.0, 68.0)
     seen = [np.interp(log.time - 0.03, log.time, column) for column in log.bend_angles.T]
-    delayed = prepare(replace(log, bend_angles=np.stack(seen, axis=1)), limb)
-    names = {"gain", "rest_angle", "log_stiffness", "log_damping", "material_damping"}
-    free = FreeTerms.of(limb, names)
-    late, deviation = BendFit(free, RodModel(limb, NODES), [delayed]).delay(free.unknowns.prior)
-    assert late == pytest.approx(0.03, abs=max(0.003, 3.0 * deviation))
-    assert deviation < 0.005
+    _, told = fit(
+        Limb.default(), replace(log, bend_angles=np.stack(seen, axis=1)), terms=["dynamics"]
+    )
+    assert told.delay[0] == pytest.approx(0.03, abs=0.004)
+    assert abs(told.delay[0] - told.taken_out) < 0.002
+    assert abs(told.value("log_damping").value) < 0.5
 
 
 def test_a_number_at_the_end_of_its_range_names_what_would_tell_it():

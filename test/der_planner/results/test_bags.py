@@ -70,7 +70,7 @@ def test_run_of_a_bag(folder: Path):
 
 
 def test_a_board_with_crossed_hoses_receives_every_setpoint(tmp_path: Path):
-    bag = BagOfRun(tmp_path / "run", run=json.dumps({"wiring": "3,1,4,2"}))
+    bag = BagOfRun(tmp_path / "run", run=json.dumps({"wiring": [2, 0, 3, 1]}))
     write_run(bag, valves=(2, 0, 3, 1))
     bag.bag.close()
     assert evaluate_bag(tmp_path / "run").checks["board_lost"] == 0

@@ -51,7 +51,7 @@ def test_registers_are_where_a_plain_server_has_them(plain_server):
     line = Line("tcp://{}:{}".format(*plain_server))
     events = []
     try:
-        data, number = host.setpoint([7_500.0, 0.0, 0.0, 20_000.0], ROOM, 0.25)
+        data, number = host.setpoint([7_500.0, 0.0, 0.0, 20_000.0])
         line.write(data)
 
         def answered():

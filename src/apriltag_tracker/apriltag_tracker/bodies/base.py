@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from apriltag_tracker.bodies.body_map import BaseFrame, BodyMap
 
@@ -37,14 +38,12 @@ def fit_frame(points: Array, places: Array) -> tuple[BaseFrame, float] | None:
     if len(points) < 3:
         return None
     middle, centre = points.mean(axis=0), places.mean(axis=0)
-    left, spread, right = np.linalg.svd((places - centre).T @ (points - middle))
-    if math.sqrt(spread[1] / len(points)) < _LEAST_SPREAD:
+    root = math.sqrt(len(points))
+    if np.linalg.svd(points - middle, compute_uv=False)[1] < _LEAST_SPREAD * root:
         return None
-    mirror = np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
-    rotation = left @ mirror @ right
-    frame = BaseFrame(rotation, centre - rotation @ middle)
-    gaps = frame.of(points) - places
-    return frame, float(np.sqrt(np.mean(np.sum(gaps**2, axis=1))))
+    turn, left = Rotation.align_vectors(places - centre, points - middle)
+    rotation = turn.as_matrix()
+    return BaseFrame(rotation, centre - rotation @ middle), left / root
 
 
 class BaseFinder:
@@ -86,14 +85,11 @@ class BaseFinder:
         self.frame = None
         if found is None:
             self.problem = (
-                "the fixed bodies that are seen tell no frame: three that are not on a line, "
-                "or one with its rotation in the map, are needed"
+                "the fixed bodies that are seen tell no frame: three off a line are needed"
             )
         elif found[1] > _MISFIT:
-            self.problem = (
-                f"the fixed bodies do not fit together ({1e3 * found[1]:.0f} mm): measure "
-                "their positions again, and check length_unit and names"
-            )
+            apart = f"{1e3 * found[1]:.0f} mm: check their positions, names and length_unit"
+            self.problem = f"the fixed bodies do not fit together, {apart}"
         else:
             (self.frame, self.residual), self.problem = found, ""
         return self.frame

@@ -15,12 +15,6 @@ from apriltag_tracker.tag_map import MapError, floats, limb_geometry, number, re
 SCHEMA_VERSION = 1
 LENGTH_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 """[m] of each unit in which positions may come."""
-AXES = {
-    sign + name: factor * np.eye(3)[index]
-    for sign, factor in (("", 1.0), ("-", -1.0))
-    for index, name in enumerate("xyz")
-}
-"""Directions that may be called up."""
 _KEYS = {"name", "place", "arc_length", "position", "height", "offset", "rotation"}
 
 
@@ -95,7 +89,6 @@ class BodyMap:
             without names.
         stiff: stretches of the limb that cannot bend, from and to in arc length [m].
         unit: [m] of a unit of length of the poses.
-        up: (3,) direction of the poses' frame in which z of `limb_base` points, roughly.
         frame: where `limb_base` is, for a set-up without enough fixed bodies; None: from these.
     """
 
@@ -105,7 +98,6 @@ class BodyMap:
     names: tuple[str, ...]
     stiff: tuple[tuple[float, float], ...] = ()
     unit: float = 1.0
-    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
     frame: BaseFrame | None = None
 
     @property
@@ -132,10 +124,9 @@ class BodyMap:
         if not isinstance(data, dict) or data.get("schema") != SCHEMA_VERSION:
             raise MapError(f"'schema: {SCHEMA_VERSION}' expected at the top of a body map")
         lengths, stiff = limb_geometry(section(data, "limb"))
-        unit, up = str(data.get("length_unit", "m")), str(data.get("up", "z"))
-        for key, value, choices in (("length_unit", unit, LENGTH_UNITS), ("up", up, AXES)):
-            if value not in choices:
-                raise MapError(f"{key} is '{value}': choose {', '.join(choices)}")
+        unit = str(data.get("length_unit", "m"))
+        if unit not in LENGTH_UNITS:
+            raise MapError(f"length_unit is '{unit}': choose {', '.join(LENGTH_UNITS)}")
         entries = data.get("bodies")
         if not isinstance(entries, list):
             raise MapError("bodies: a list of entries 'name: …, arc_length: …' expected")
@@ -153,16 +144,7 @@ class BodyMap:
                 "bodies: at least one must have 'place: clamp' or 'place: world', or the key frame "
                 "must say where limb_base is"
             )
-        return cls(
-            segment_lengths=lengths,
-            limb=limb,
-            fixed=fixed,
-            names=names,
-            stiff=stiff,
-            unit=LENGTH_UNITS[unit],
-            up=tuple(AXES[up].tolist()),
-            frame=frame,
-        )
+        return cls(lengths, limb, fixed, names, stiff, LENGTH_UNITS[unit], frame)
 
 
 def _body(entry: Any, total: float) -> BodyOnLimb | FixedBody:

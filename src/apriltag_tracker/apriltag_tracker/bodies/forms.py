@@ -54,10 +54,8 @@ def message_type(form: str) -> Any:
     try:
         return getattr(importlib.import_module(f"{package}.msg"), kind)
     except ImportError as error:
-        raise PoseFormError(
-            f"form '{form}' needs the package {package}: install ros-jazzy-"
-            f"{package.replace('_', '-')}, or have the poses published as geometry_msgs"
-        ) from error
+        name = f"ros-jazzy-{package.replace('_', '-')}"
+        raise PoseFormError(f"form '{form}' needs the package {package}: install {name}") from error
 
 
 def topics_of(form: str, topic: str, names: tuple[str, ...]) -> dict[str, str]:
@@ -104,9 +102,8 @@ def poses_of(form: str, message: Any, name: str, names: tuple[str, ...]) -> Iter
     elif len(message.poses) == len(names):
         found = list(zip(names, message.poses, strict=True))
     else:
-        raise PoseFormError(
-            f"an array of {len(message.poses)} poses came, the body map has {len(names)} bodies"
-        )
+        came = f"an array of {len(message.poses)} poses came"
+        raise PoseFormError(f"{came}, the body map has {len(names)} bodies")
     for each, pose in found:
         yield BodyPose(each, _stamp(message), _numbers(pose.position, pose.orientation))
 

@@ -99,7 +99,6 @@ class PoseTrackerNode(LimbStateNode):
             "frames_missed": self._gaps.missed,
             "unknown_bodies": dict(unknown),
             "bodies_misplaced": tracker.follower.misplaced,
-            "bodies_swapped": tracker.swapped,
             "base_residual_mm": f"{1e3 * tracker.base.residual:.2f}",
             **tracker.plane.values(),
         }

@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 
 from apriltag_tracker.bodies.base import BaseFinder, PlaneWatch
@@ -20,7 +19,7 @@ from apriltag_tracker.pose.following import (
     LimbFollower,
     survey_errors,
 )
-from apriltag_tracker.pose.shape import CURVE_POINTS, PlanarTag, centreline_pose
+from apriltag_tracker.pose.shape import PlanarTag, centreline_pose
 
 Array = NDArray[np.float64]
 
@@ -30,10 +29,6 @@ _FROZEN_FRAMES = 3
 """A body whose pose has been the very same for so many frames while others moved is lost."""
 _CLOCK_SET = 1_000_000_000
 """Stamps that go back by more than this are of a clock that was set [ns]."""
-_SWAP_AGE = 0.2
-"""Age of the last shape that tells which body is which [s]."""
-_SWAP_GAIN = 0.25
-"""Other names for the bodies are taken where they bring the distances down to this share."""
 
 
 class PoseFrame(NamedTuple):
@@ -157,8 +152,6 @@ class BodyTracker:
         self._turns = np.array([body.rotation for body in bodies.limb])
         self._before: Array | None = None
         self._same = np.zeros(len(bodies.names), dtype=np.int64)
-        self.swapped = 0
-        """Frames in which bodies had each other's names."""
 
     def observe(self, frame: PoseFrame) -> BodyObservation:
         """Find the limb in one frame."""
@@ -176,9 +169,7 @@ class BodyTracker:
         if base is None:
             return BodyObservation(Followed(None, f"no base: {self.base.problem}"), places)
         points = base.of(positions[self._index])
-        axes = base.rotation @ rotations[self._index]
-        order = self._sort_out(points, stamp)
-        points, axes = points[order], axes[order] @ self._turns.transpose(0, 2, 1)
+        axes = base.rotation @ rotations[self._index] @ self._turns.transpose(0, 2, 1)
         self.plane.take(points)
         places[:, :2] = points[:, :2]
         places[:, 2] = np.where(
@@ -195,13 +186,6 @@ class BodyTracker:
             for k in seen
         ]
         followed = self.follower.follow(planar, stamp, self._shared(places[seen]))
-        wrong = np.flatnonzero(order != np.arange(len(order)))
-        if len(wrong):
-            self.swapped += 1
-            names = ", ".join(self.bodies.limb[k].name for k in wrong)
-            said = f"bodies have each other's names: {names}"
-            reason = f"{followed.reason}; {said}" if followed.reason else said
-            followed = followed._replace(reason=reason)
         return BodyObservation(followed, places)
 
     def _frozen(self, frame: PoseFrame) -> NDArray[np.bool_]:
@@ -214,28 +198,3 @@ class BodyTracker:
         self._before = now
         frozen = self._same >= _FROZEN_FRAMES
         return frozen if not frozen[np.isfinite(now).all(axis=1)].all() else np.zeros_like(frozen)
-
-    def _sort_out(self, points: Array, stamp: float) -> NDArray[np.int64]:
-        """Return whose pose each of the limb's bodies has, (m,): its own, if names are right.
-
-        A tracker that confuses bodies gives one the pose of another: where the last shape is well
-        explained so, and badly by the names, the names are wrong.
-        """
-        own = np.arange(len(points))
-        last = self.follower.last(stamp, _SWAP_AGE)
-        seen = np.flatnonzero(np.isfinite(points).all(axis=1))
-        if last is None or len(seen) < 2:
-            return own
-        along = np.linspace(0.0, self.bodies.length, CURVE_POINTS)
-        heading = np.unwrap(np.arctan2(*np.gradient(last.curve, axis=0).T[::-1]))
-        turn = np.interp(self._arcs, along, heading)
-        axes = np.stack([np.cos(turn), np.sin(turn)], axis=1)
-        sideways = axes[:, ::-1] * [-1.0, 1.0]
-        offsets = np.array([body.offset for body in self.bodies.limb])
-        middle = np.stack([np.interp(self._arcs, along, each) for each in last.curve.T], axis=1)
-        expected = (middle + offsets[:, :1] * axes + offsets[:, 1:2] * sideways)[seen]
-        distances = np.linalg.norm(expected[:, None] - points[None, seen, :2], axis=2)
-        rows, columns = linear_sum_assignment(distances)
-        if distances[rows, columns].sum() < _SWAP_GAIN * np.trace(distances):
-            own[seen[rows]] = seen[columns]
-        return own

@@ -131,12 +131,6 @@ class LimbFollower:
         self.misplaced = 0
         """What was left out so far because it was on the wrong place."""
 
-    def last(self, stamp: float, age: float) -> LimbEstimate | None:
-        """Return the last estimate that was seen less than ``age`` [s] before a stamp [s]."""
-        if not self._history or not 0.0 <= stamp - self._history[-1][0] < age:
-            return None
-        return self._history[-1][1]
-
     def follow(
         self,
         seen: Sequence[PlanarTag],

@@ -12,6 +12,9 @@ from apriltag_tracker.bodies.body_map import BodyMap
 from apriltag_tracker.bodies.tracker import PoseFrame
 from apriltag_tracker.synthetic.shapes import Shape
 
+UPRIGHT = {"z": (0.0, 0.0, 0.0), "y": (-np.pi / 2, 0.0, 0.0), "x": (0.0, np.pi / 2, 0.0)}
+"""The turn that brings z to each axis, about an axis [rad]."""
+
 
 @dataclass(frozen=True)
 class MocapFaults:
@@ -38,11 +41,12 @@ class SyntheticMocap:
     """Tells the poses of the bodies on and around a limb.
 
     Args:
-        bodies: the body map; poses come in its unit, and with its axis up.
+        bodies: the body map; poses come in its unit.
         faults: what is wrong with them.
         turn: of `limb_base` about the axis that is up, in the frame of the poses [rad].
         tilt: of the plane of motion against the floor [rad].
         seed: of noise and dropouts.
+        up: axis of the poses' frame that points up, of `UPRIGHT`.
 
     Raises:
         ValueError: a body that is to be swapped is not in the map.
@@ -55,20 +59,18 @@ class SyntheticMocap:
         turn: float = 0.3,
         tilt: float = 0.0,
         seed: int = 0,
+        up: str = "z",
     ) -> None:
         self.bodies, self.faults = bodies, faults or MocapFaults()
         for name in self.faults.swapped:
             if name not in bodies.names:
                 raise ValueError(f"no body '{name}' to swap: there are {', '.join(bodies.names)}")
         self._random = np.random.default_rng(seed)
-        first = int(np.argmax(np.abs(bodies.up)))
-        beside = np.eye(3)[(first + 1) % 3]
-        up = np.array(bodies.up)
-        level = np.column_stack([beside, np.cross(up, beside), up])
+        level = Rotation.from_rotvec(np.array(UPRIGHT[up]))
         # limb_base in the frame of the poses
         self.rotation: NDArray[np.float64] = (
-            level @ Rotation.from_euler("zx", [turn, tilt]).as_matrix()
-        )
+            level * Rotation.from_euler("zx", [turn, tilt])
+        ).as_matrix()
         self.origin = np.array([0.4, -0.2, 0.9])
         """Where the clamp is in the frame of the poses [m]."""
         self._started: int | None = None

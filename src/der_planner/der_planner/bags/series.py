@@ -119,7 +119,7 @@ def run_of(record: BagRecord, namespace: str, plan_id: str = "") -> RunSeries:
         commanded=stream(limb.commanded, segment_count, origin),
         measured=stream(limb.measured, segment_count, origin),
         truth=stream(limb.truth, 2, origin) if len(limb.truth) else None,
-        board=_board(limb, setpoints, origin, str(record.run.get("wiring", ""))),
+        board=_board(limb, setpoints, origin, record.run.get("wiring")),
         faults=tuple(dict.fromkeys(faults)),
         touches=tuple(
             f"from {(since - origin) / NANOSECONDS:.2f} s on, {said}"
@@ -175,13 +175,14 @@ def _origin(stamp: int, times: Array, setpoints: _Setpoints) -> int:
     return int(starts[len(starts) // 2])  # a mean of int64 stamps would lose nanoseconds
 
 
-def _board(limb: LimbRecord, setpoints: _Setpoints, origin: int, wiring: str) -> BoardLog | None:
-    """Return what the board received; ``wiring`` is the driver's parameter of that name."""
+def _board(
+    limb: LimbRecord, setpoints: _Setpoints, origin: int, valves: list[int] | None
+) -> BoardLog | None:
+    """Return what the board received; ``valves`` are those of the chambers, None: their own."""
     if not len(limb.board) or not len(setpoints.index):
         return None
     stamps, count = limb.board.stamps(), 2 * setpoints.value.shape[1]
-    valves = [int(word) - 1 for word in wiring.replace(",", " ").split()] or range(count)
-    chambers = limb.board.values(count)[:, valves]
+    chambers = limb.board.values(count)[:, valves or range(count)]
     return BoardLog(
         setpoint_time=(setpoints.stamp - origin) / NANOSECONDS,
         setpoint=setpoints.value,

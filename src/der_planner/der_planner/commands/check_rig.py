@@ -2,7 +2,7 @@
 
     python3 scripts/check_rig.py --hardware my_rig.yaml --out my_checked_rig.yaml
     python3 scripts/check_rig.py --bag checks/DATE/bag --out my_checked_rig.yaml
-    python3 scripts/check_rig.py --seed 3 --wiring 3 4 2 1                   # the twin's graph
+    python3 scripts/check_rig.py --seed 3 --wiring 3 4 2 1 --out rig.yaml    # the twin's graph
 
 Each chamber is filled gently, alone, for three seconds: half a minute for two segments. The rig
 file that is written is the one that was given, with the wiring that was found for the driver, and
@@ -13,6 +13,7 @@ be played; 3: it contradicts itself, and no file is written; 1: an error; 2: bad
 from __future__ import annotations
 
 import argparse
+import copy
 import sys
 import time
 from collections.abc import Mapping
@@ -24,7 +25,7 @@ import numpy as np
 import yaml
 
 from apriltag_tracker.bodies.body_map import BodyMap
-from apriltag_tracker.pose.clamp import Clamp, find_clamp
+from apriltag_tracker.pose.clamp import Clamp, at_clamp, find_clamp
 from apriltag_tracker.tag_map import LimbTag, MapError, TagMap
 from der_planner.bags.reader import BagError, BagReader
 from der_planner.bags.record import PRESSURE_TYPE, Columns, header_stamp
@@ -45,6 +46,7 @@ from der_planner.twin import TwinError
 from der_planner.twin.wiring import Wiring
 from limb_interfaces import topics
 from pressure_driver.following import valves_of
+from pressure_driver.protocols import NAMES
 from pressure_driver.settings import SettingError, Settings
 
 TAGS_TYPE = "der_msgs/msg/TagDetectionArray"
@@ -76,6 +78,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="CHAMBER",
         help="of the twin: the chamber that each valve fills, from 1; minus: bends the other way",
     )
+    parser.add_argument("--board", choices=NAMES, default=NAMES[0], help="of the twin")
     parser.add_argument("--poses", action="store_true", help="of the twin: motion capture, no tags")
     parser.add_argument("--folder", type=Path, help="for bag and logs (default: checks/ and time)")
     parser.add_argument("--out", type=Path, metavar="FILE", help="rig file to write")
@@ -83,37 +86,60 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _main(given: argparse.Namespace) -> int:
-    hardware = Hardware.from_yaml(given.hardware) if given.hardware else None
-    if hardware is not None and (given.wiring or given.poses):
+    if given.hardware and (given.wiring or given.poses):
         raise OptionError("--wiring and --poses are about the twin: leave --hardware out")
+    content: dict[str, Any] = {"driver": {"protocol": given.board}, "twin": {}}
+    if given.wiring:
+        content["twin"] = {"wiring": list(Wiring(tuple(given.wiring)).chambers)}
+    if given.poses:
+        content["poses"] = {}
+    hardware = Hardware(**copy.deepcopy(content))
+    if given.hardware:
+        hardware = Hardware.from_yaml(given.hardware)
+        content = yaml.safe_load(given.hardware.read_text())
     if not 500.0 <= given.pressure <= 20_000.0:
         raise OptionError(f"--pressure is {given.pressure:g} Pa: choose 500 to 20000")
     if given.out is not None:
         check_file(given.out)
     bag = given.bag or _play(given, hardware)
-    bodies = _bodies(given, hardware)
+    map_path = _map_path(hardware)
+    bodies = (TagMap if hardware.poses is None else BodyMap).from_yaml(map_path)
     log = read_check(bag, bodies)
     finding = find_rig(log)
     lines = finding.lines()
-    offsets = [body.offset for body in bodies.limb]
-    clamp = find_clamp(bodies, log.arc_lengths, offsets, log.places)
+    clamp = find_clamp(bodies, log.places)
     if clamp is not None and not finding.contradictions:
         lines += clamp_lines(clamp)
     lines += _plane_line(bag)
     print("\n".join(lines))
     try:
-        wiring = played_wiring(finding, hardware.driver if hardware else {})
+        wiring = played_wiring(finding, hardware.driver)
     except (SettingError, RigError) as error:
         print(f"no file is written: {error}", file=sys.stderr)
         return 3
     if given.out is not None:
-        content = yaml.safe_load(given.hardware.read_text()) if given.hardware else {}
-        content["driver"] = {**content.get("driver", {}), "wiring": wiring}
+        content["driver"] = {**(content.get("driver") or {}), "wiring": wiring}
         content["found"] = lines
         given.out.parent.mkdir(parents=True, exist_ok=True)
+        if clamp is not None and is_off(clamp):
+            _move_base(content, map_path, clamp, given.out)
         given.out.write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True))
         print(f"rig file: {given.out}")
     return 0
+
+
+def _move_base(content: dict[str, Any], map_path: Path, clamp: Clamp, out: Path) -> None:
+    """Write the map with `limb_base` at the clamp beside the rig file, which then names it."""
+    node, parameter = ("poses", "body_map") if "poses" in content else ("tracker", "tag_map")
+    moved = out.with_suffix(f".{parameter}.yaml").resolve()
+    written = at_clamp(yaml.safe_load(map_path.read_text()), clamp)
+    moved.write_text(yaml.safe_dump(written, sort_keys=False))
+    parameters = content.get(node) or {}
+    if "host" in parameters:
+        print(f"map with limb_base at the clamp, for {parameters['host']}: {moved}")
+        return
+    content[node] = {**parameters, parameter: str(moved)}
+    print(f"map with limb_base at the clamp: {moved}")
 
 
 def _plane_line(bag: Path) -> list[str]:
@@ -138,15 +164,17 @@ def clamp_lines(clamp: Clamp) -> list[str]:
         f"clamp in limb_base: x {1e3 * x:.1f} ± {1e3 * x_sigma:.1f} mm, y {1e3 * y:.1f} ± "
         f"{1e3 * y_sigma:.1f} mm, turned by {np.degrees(turn):.1f} ± {np.degrees(turn_sigma):.1f}°"
     ]
-    if (np.abs(clamp.place) > np.maximum(CLAMP_OFF, 3.0 * clamp.sigma)).any():
-        lines.append(
-            "warning: limb_base is not at the clamp: take this off the positions of the fixed tags "
-            "or bodies in their map"
-        )
+    if is_off(clamp):
+        lines.append("warning: limb_base is not at the clamp: --out writes a map in which it is")
     return lines
 
 
-def _play(given: argparse.Namespace, hardware: Hardware | None) -> Path:
+def is_off(clamp: Clamp) -> bool:
+    """Return whether the limb surely begins beside the origin of `limb_base`."""
+    return bool((np.abs(clamp.place) > np.maximum(CLAMP_OFF, 3.0 * clamp.sigma)).any())
+
+
+def _play(given: argparse.Namespace, hardware: Hardware) -> Path:
     """Play a check on the graph; return its bag."""
     # ROS is imported only by who needs it.
     from der_planner.experiment.graph_trials import play_calibration  # noqa: PLC0415
@@ -154,26 +182,21 @@ def _play(given: argparse.Namespace, hardware: Hardware | None) -> Path:
     interrupt_once()
     folder = given.folder or Path("checks") / time.strftime("%Y-%m-%d_%H-%M-%S")
     check_folder(folder, "--folder")
-    driver = {**vars(Settings()), **(hardware.driver if hardware else {})}
+    driver = {**vars(Settings()), **hardware.driver}
     count, limit = int(driver["segment_count"]), float(driver["pressure_limit"])
     run = within_limits(check_run(count, given.pressure), limit, float(driver["slew_limit"]))
-    wiring = Wiring(tuple(given.wiring)).chambers if given.wiring else None
-    return play_calibration(
-        run, folder.resolve(), Progress(), Limb.default(), given.seed, hardware, wiring, given.poses
-    )
+    return play_calibration(run, folder.resolve(), Progress(), Limb.default(), given.seed, hardware)
 
 
-def _bodies(given: argparse.Namespace, hardware: Hardware | None) -> TagMap | BodyMap:
-    """Return the map of the tags or bodies that the tracker of the check has."""
+def _map_path(hardware: Hardware) -> Path:
+    """Return the file of the tracker's map of tags or bodies."""
     # Only with ROS there is a share folder to look in.
     from ament_index_python.packages import get_package_share_directory  # noqa: PLC0415
 
     share = Path(get_package_share_directory("apriltag_tracker")) / "config"
-    if given.poses or (hardware is not None and hardware.poses is not None):
-        poses = (hardware.poses if hardware else None) or {}
-        return BodyMap.from_yaml(poses.get("body_map", share / "bodies.yaml"))
-    tracker = hardware.tracker if hardware else {}
-    return TagMap.from_yaml(tracker.get("tag_map", share / "tags.yaml"))
+    if hardware.poses is not None:
+        return Path(hardware.poses.get("body_map", share / "bodies.yaml"))
+    return Path(hardware.tracker.get("tag_map", share / "tags.yaml"))
 
 
 def played_wiring(finding: RigFinding, driver: Mapping[str, Any]) -> str:

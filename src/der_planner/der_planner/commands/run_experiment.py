@@ -303,9 +303,9 @@ def _read(limb: Path | None) -> Limb:
 
 
 def _stage(options: Options) -> str:
-    if options.hardware is not None:
+    if options.hardware is not None and options.hardware.twin is None:
         return f"the hardware at {options.hardware.place}"
-    return "the twin, offline" if options.offline else f"the twin, with a {options.board} board"
+    return "the twin, offline" if options.offline else f"the twin, board {options.board}"
 
 
 def _describe(

@@ -37,8 +37,9 @@ def experiment_page(options: Options, progress: Progress) -> Iterator[NodeProces
     setup = GraphSetup(Path(), {}, hardware=options.hardware, planner=planner, page=options.page)
     (spec,) = [each for each in setup.nodes("") if each.executable == "page"]
     parameters = {**spec.parameters, "report": str(options.out / "report")}
-    remap = options.hardware.remap if options.hardware else {}
-    page = NodeProcess(spec.package, spec.executable, parameters, options.out / "logs", remap)
+    page = NodeProcess(
+        spec.package, spec.executable, parameters, options.out / "logs", setup.rig.remap
+    )
     try:
         with GraphClient(NAME) as client:
             client.watch([page])

@@ -60,12 +60,12 @@ def running_graph(
     graph = RunningGraph(client, progress)
     client.subscribe(PressureState, topics.PRESSURE_STATE, qos.STATES)
     with tempfile.TemporaryDirectory(prefix="der_limb_") as folder:
-        port = board_line(setup.board, folder)
+        port = board_line(setup.protocol, folder)
         specs = setup.nodes(port)
         client.spin(DISCOVERY)
         _refuse_second_graph(client, specs)
         try:
-            graph.start(specs, port, logs, setup.hardware.remap if setup.hardware else {})
+            graph.start(specs, port, logs, setup.rig.remap)
             # A graph that was not seen at once, or that began meanwhile, is known by now.
             _refuse_second_graph(client, specs, own=1)
             graph.bag = Path(client.call("recorder/start"))

@@ -184,8 +184,6 @@ def play_calibration(
     prior: Limb,
     seed: int = 0,
     hardware: Hardware | None = None,
-    wiring: tuple[int, ...] | None = None,
-    poses: bool = False,
 ) -> Path:
     """Play the pressures of a calibration; say when the driver did not take all of them.
 
@@ -196,8 +194,6 @@ def play_calibration(
         prior: whose gravity and masses the twin gets.
         seed: of the twin.
         hardware: in place of the twin.
-        wiring: of the twin, as of `GraphSetup`.
-        poses: of the twin, as of `GraphSetup`.
 
     Returns:
         The bag.
@@ -206,24 +202,17 @@ def play_calibration(
         GraphError, NodeError: as `play_on_graph`.
     """
     count = len(excitation.time)
-    stage = f"the hardware at {hardware.place}" if hardware else f"the twin of seed {seed}"
+    real = hardware is not None and hardware.twin is None
+    stage = f"the hardware at {hardware.place}" if hardware and real else f"the twin of seed {seed}"
     progress.say(f"playing {excitation.duration:.0f} s on {stage}, into {folder}")
     metadata = {
         "motion": excitation.name,
         "stage": stage,
-        "seed": None if hardware else seed,
+        "seed": None if real else seed,
         "largest_pressure_Pa": float(np.abs(excitation.differential_pressure).max()),
         "prior": prior.name,
     }
-    setup = GraphSetup(
-        folder / "bag",
-        metadata,
-        seed=seed,
-        limb=prior,
-        hardware=hardware,
-        poses=poses,
-        wiring=wiring,
-    )
+    setup = GraphSetup(folder / "bag", metadata, seed=seed, limb=prior, hardware=hardware)
     # The driver refuses a plan that it has heard before an arming: each run has its own.
     plan_id = f"{excitation.name}-{uuid.uuid4().hex[:8]}"
     sent = 0

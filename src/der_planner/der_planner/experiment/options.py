@@ -276,6 +276,7 @@ def parse(arguments: Sequence[str]) -> Options:
     _check_names("board", (given.board,), BOARDS)
     hardware = Hardware.from_yaml(given.hardware) if given.hardware else None
     limb = given.limb or (Path(hardware.limb) if hardware and hardware.limb else None)
+    real = hardware is not None and hardware.twin is None
     for wrong, said in (
         (given.nearest and given.path is None, "--nearest is about a path: give --path FILE.csv"),
         (
@@ -287,17 +288,17 @@ def parse(arguments: Sequence[str]) -> Options:
             "--offline simulates everything: it does not go with --hardware",
         ),
         (
-            given.board != BOARDS[0] and (given.offline or hardware is not None),
+            given.board != BOARDS[0] and (given.offline or real),
             "--board is about the twin's nodes: not for --offline; a file of --hardware names its "
             "own as driver.protocol",
         ),
         (
-            given.poses and (given.offline or hardware is not None),
+            given.poses and (given.offline or real),
             "--poses is motion capture of the twin: it goes with neither --offline nor --hardware "
             "(a hardware file has the key poses)",
         ),
         (
-            hardware is not None and limb is None,
+            real and limb is None,
             "--hardware needs a limb file: --limb FILE (scripts/calibrate_limb.py)",
         ),
         (

@@ -22,6 +22,7 @@ import yaml
 from der_planner.experiment.console import OptionError
 from der_planner.limb import Limb
 from der_planner.planning import Obstacles
+from pressure_driver.following import valves_of
 
 STOP_ORDER = (
     "planner",
@@ -64,6 +65,7 @@ class Hardware:
 
     Attributes:
         driver, tracker, planner, recorder: parameters by name for each node.
+        twin: parameters of the twin, which then stands there instead of hardware.
         poses: parameters of the tracker of bodies, where motion capture stands in place of the
             camera; None: the camera.
         found: what scripts/check_rig.py has written; for people.
@@ -75,6 +77,7 @@ class Hardware:
 
     driver: dict[str, Any] = field(default_factory=dict)
     tracker: dict[str, Any] = field(default_factory=dict)
+    twin: dict[str, Any] | None = None
     poses: dict[str, Any] | None = None
     found: tuple[str, ...] = ()
     planner: dict[str, Any] = field(default_factory=dict)
@@ -106,8 +109,8 @@ class Hardware:
         hardware = cls(**{key: value for key, value in content.items() if value is not None})
         hardware.hosts.update(_hosts(hardware, path))
         port = str(hardware.driver.get("port", ""))
-        here = "pressure_driver" not in hardware.hosts and not port.startswith("tcp://")
-        if here and not (port and Path(port).exists()):
+        elsewhere = "pressure_driver" in hardware.hosts or port.startswith("tcp://")
+        if hardware.twin is None and not elsewhere and not (port and Path(port).exists()):
             raise OptionError(
                 f"hardware file {path}: no serial device '{port}' (driver.port); is the valve "
                 "board plugged in? `ls /dev/serial/by-id` shows what is there"
@@ -162,7 +165,6 @@ class GraphSetup:
         record_images: whether the bag holds the raw images, too.
         page: port of the operator's page; None for a graph without one.
         poses: simulated motion capture in place of the twin's camera.
-        wiring: of the twin, as its parameter; None: as everybody expects.
         obstacles: in the twin's way.
     """
 
@@ -177,17 +179,28 @@ class GraphSetup:
     record_images: bool = False
     page: int | None = None
     poses: bool = False
-    wiring: tuple[int, ...] | None = None
     obstacles: Obstacles | None = None
+
+    @property
+    def rig(self) -> Hardware:
+        """What is known of the hardware, or of the twin in its place."""
+        return self.hardware or Hardware(twin={})
+
+    @property
+    def protocol(self) -> str:
+        """Language of the twin's board."""
+        return str(self.rig.driver.get("protocol", self.board))
 
     def nodes(self, port: str) -> list[NodeSpec]:
         """Return the nodes in the order in which they start; the emulated board is at ``port``."""
-        rig = self.hardware or Hardware()
-        language = {"protocol": self.board, **BOARD_PARAMETERS.get(self.board, {})}
+        rig = self.rig
+        language = {"protocol": self.protocol, **BOARD_PARAMETERS.get(self.protocol, {})}
         board = {"port_link": port, "seed": self.seed, **language}
         twin = {"seed": self.seed, "run": self.run, **_twin_loads(self.limb)}
-        driver = {"port": port, **(language if self.hardware is None else {}), **rig.driver}
-        wired = {"wiring": driver["wiring"]} if driver.get("wiring") else {}
+        driver = {"port": port, **(language if rig.twin is not None else {}), **rig.driver}
+        wired = {}
+        if wiring := driver.get("wiring"):
+            wired = {"wiring": valves_of(wiring, 2 * driver.get("segment_count", 2))}
         recorder = {
             "output": str(self.bag),
             "metadata": json.dumps(self.metadata | wired),
@@ -196,18 +209,18 @@ class GraphSetup:
         }
         poses = rig.poses
         specs = [NodeSpec("pressure_driver", "pressure_driver", driver)]
-        if self.hardware is None:
+        if rig.twin is not None:
             specs.insert(0, NodeSpec("pressure_driver", "board_emulator", board))
-            if self.wiring is not None:
-                twin["wiring"] = list(self.wiring)
+            twin |= rig.twin
             if self.obstacles is not None:
                 twin["pegs"] = self.obstacles.circles.ravel().tolist()
             camera = NodeSpec("apriltag_tracker", "synthetic_camera", {"seed": self.seed})
-            if self.poses:
-                poses = {"form": "pose_array"}
+            if self.poses or poses is not None:
+                form = {"form": "pose_array"}
                 twin["rate"] = POSE_RATE
+                poses = {**form, **(poses or {})}
                 camera = NodeSpec(
-                    "apriltag_tracker", "synthetic_poses", {"seed": self.seed, **poses}
+                    "apriltag_tracker", "synthetic_poses", {"seed": self.seed, **form}
                 )
             specs += [NodeSpec("der_planner", "limb_twin", twin), camera]
         if poses is not None:

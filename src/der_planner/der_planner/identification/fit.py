@@ -56,6 +56,8 @@ EVEN_ERROR = np.deg2rad(5.0)
 """Error of the bend angle of an evenly bent segment in the start in closed form [rad]."""
 LARGEST_CHANGE = 0.6
 """Largest change of the logarithm of the stiffness in the start in closed form."""
+SHORTEST_DELAY = 0.005
+"""A fit is repeated without a delay of what was seen from this on [s]."""
 STIFFER_STARTS = (0.0, 0.25, 0.5, 0.9)
 """Added to the logarithm of the stiffness, or taken off that of the mass, until the rod can follow
 the log from there."""
@@ -95,6 +97,24 @@ def fit(
         raise LogError(
             "a known weight tells the stiffness: leave dynamics among the terms, and the mass out"
         )
+    found, report = _fit(limb, log, groups, longest_gap, weight)
+    late, deviation = report.delay
+    if abs(late) < max(SHORTEST_DELAY, 3.0 * deviation):
+        return found, report
+    # What was seen late would pass for damping and inertia.
+    earlier = log.seen_earlier(late, longest_gap)
+    found, report = _fit(limb, earlier, groups, longest_gap, weight)
+    return found, replace(report, delay=(late + report.delay[0], report.delay[1]), taken_out=late)
+
+
+def _fit(
+    limb: Limb,
+    log: CalibrationLog,
+    groups: Collection[str],
+    longest_gap: float,
+    weight: tuple[float, float] | None,
+) -> tuple[Limb, FitReport]:
+    """Identify a limb from a log whose stamps are true."""
     recorded = prepare(log, limb, longest_gap)
     hung = HungWeight.found(recorded, *weight) if weight else None
     if hung is not None:

@@ -71,10 +71,7 @@ def read_poses(path: Path) -> PoseLog:
             return _qualisys(path, lines)
     except (ValueError, IndexError, KeyError, StopIteration) as error:
         raise LogError(f"the table {path} is not as its program writes it: {error}") from error
-    raise LogError(
-        f"{path} is no table of motion capture that is known: export it from Motive as CSV, or "
-        "from QTM as TSV of 6DOF data, each with its header"
-    )
+    raise LogError(f"{path}: export it from Motive as CSV, or from QTM as TSV of 6DOF, with header")
 
 
 def lines_of(path: Path) -> list[str]:
@@ -102,15 +99,11 @@ def _motive(path: Path, lines: Sequence[str]) -> PoseLog:
     about = dict(zip(rows[0][::2], rows[0][1::2], strict=False))
     unit = _MOTIVE_UNITS.get(about.get("Length Units", "Meters"))
     if unit is None or about.get("Rotation Type", "Quaternion") != "Quaternion":
-        raise LogError(
-            f"{path}: lengths in {about.get('Length Units')}, rotations as "
-            f"{about.get('Rotation Type')}: export meters or millimeters, and quaternions"
-        )
+        told = f"lengths in {about.get('Length Units')}, rotations as {about.get('Rotation Type')}"
+        raise LogError(f"{path}: {told}: export meters or millimeters, and quaternions")
     header = {row[1]: row for row in rows[1:] if len(row) > 1}
-    columns = {
-        head: k
-        for k, head in enumerate(zip(header["Type"], header["Name"], *rows[-2:], strict=False))
-    }
+    heads = zip(header["Type"], header["Name"], *rows[-2:], strict=False)
+    columns = {head: k for k, head in enumerate(heads)}
     names = tuple(name for kind, name, part, axis in columns if (kind, part, axis) == _BODY)
     if not names:
         raise LogError(f"{path} holds no rigid bodies: export them from Motive, not markers alone")
@@ -176,10 +169,8 @@ def bends_of(log: PoseLog, body_map: Path, time: Array) -> tuple[Array, Array]:
             angles[k], tips[k] = followed.estimate.bend_angle, followed.estimate.tip
     if np.isnan(tips).all():
         raise LogError(f"no frame of the poses shows the limb: {reason}")
-    return (
-        on_grid(log.time, angles, time, LONGEST_SILENCE),
-        on_grid(log.time, tips, time, LONGEST_SILENCE),
-    )
+    angles, tips = (on_grid(log.time, each, time, LONGEST_SILENCE) for each in (angles, tips))
+    return angles, tips
 
 
 def read_bag_table(path: Path) -> dict[str, Array]:

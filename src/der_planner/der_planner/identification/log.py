@@ -100,6 +100,14 @@ class CalibrationLog:
         after = float(np.nextafter(edge, np.inf))
         return self.between(self.time[0], edge), self.between(after, self.time[-1])
 
+    def seen_earlier(self, seconds: float, longest_gap: float = LONGEST_GAP) -> CalibrationLog:
+        """Return the log with what was seen put to instants that are earlier by some seconds."""
+
+        def moved(table: Array) -> Array:
+            return on_grid(self.time - seconds, table, self.time, longest_gap)
+
+        return replace(self, bend_angles=moved(self.bend_angles), tip=moved(self.tip))
+
     def _of(self, time: Array, table: Callable[[Array], Array]) -> CalibrationLog:
         """Return the log at other instants, its tables changed by a function."""
         commanded, measured = table(self.commanded_differential), table(self.measured_differential)

@@ -70,6 +70,7 @@ class FitReport:
         duration: of the log [s].
         rows: used by the fit.
         delay: by which what was seen is late, and its standard deviation [s].
+        taken_out: the part of it that was taken off the stamps before the fit [s].
         warnings: sentences.
     """
 
@@ -86,6 +87,7 @@ class FitReport:
     duration: float
     rows: int
     delay: tuple[float, float] = (math.nan, math.nan)
+    taken_out: float = 0.0
     warnings: tuple[str, ...] = ()
 
     def value(self, name: str) -> Unknown:
@@ -126,7 +128,8 @@ class FitReport:
         if abs(late) > 3.0 * deviation:
             lines.append(
                 f"what was seen is {1e3 * late:.0f} ± {1e3 * deviation:.0f} ms late: the trackers' "
-                f"parameter sensor_delay takes {late:.3f} s off their stamps"
+                f"parameter sensor_delay takes {late:.3f} s off their stamps. The fit is without "
+                f"{1e3 * self.taken_out:.0f} ms of it"
             )
         for i, j in np.argwhere(np.tril(np.abs(self.correlation) > STRONG, -1)):
             lines.append(

@@ -7,6 +7,7 @@ order along the limb.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -105,13 +106,10 @@ class ValveFinding(NamedTuple):
 
     def text(self) -> str:
         """Say it in a line."""
-        moves = "moves nothing"
+        moves, reads = "moves nothing", "no sensor reads it"
         if self.segment is not None:
-            moves = (
-                f"bends segment {self.segment + 1} to the {SIDES[self.side]} by "
-                f"{np.degrees(abs(self.bend)):.1f}°"
-            )
-        reads = "no sensor reads it"
+            angle = np.degrees(abs(self.bend))
+            moves = f"bends segment {self.segment + 1} to the {SIDES[self.side]} by {angle:.1f}°"
         if self.sensor is not None:
             reads = f"sensor {self.sensor + 1} reads {self.rise:.0f} Pa"
         lags = f"{1e3 * self.to_pressure:.0f} + {1e3 * self.to_motion:.0f} ms"
@@ -183,12 +181,11 @@ def find_rig(log: RigLog) -> RigFinding:
         RigError: a chamber was not filled in the log, or too little was seen of the limb.
     """
     fills = _fills(log)
-    ways = np.array([_change(log.seen_time, log.places, fill)[0] for fill in fills])
-    ways[..., 2] = np.angle(np.exp(1j * ways[..., 2]))
+    ways = np.array([_change(log.seen_time, log.places[..., :2], fill)[0] for fill in fills])
     blind = np.isnan(ways).any(axis=(0, 2))
     if blind.all():
         raise RigError("nothing was seen of the limb: does the tracker see its tags or bodies?")
-    moved = np.sqrt(np.nansum(ways[..., :2] ** 2, axis=(0, 2)))
+    moved = np.sqrt(np.nansum(ways**2, axis=(0, 2)))
     along = sorted((int(k) for k in np.flatnonzero(~blind)), key=lambda k: moved[k])
     arcs = np.sort(log.arc_lengths[along])
     ends = _segment_ends(arcs, log.segment_lengths)
@@ -198,12 +195,8 @@ def find_rig(log: RigLog) -> RigFinding:
     contradictions, warnings = _compare(valves, len(log.segment_lengths))
     expected = [int(k) for k in np.argsort(log.arc_lengths) if not blind[k]]
     if along != expected:
-        wrong = ", ".join(
-            f"{log.names[is_there]} is where the map has {log.names[said]}"
-            for is_there, said in zip(along, expected, strict=True)
-            if is_there != said
-        )
-        contradictions.append(f"the bodies are in another order along the limb: {wrong}")
+        there, said = (", ".join(log.names[k] for k in order) for order in (along, expected))
+        contradictions.append(f"along the limb are {there}, and in the map {said}")
     warnings += [f"{log.names[k]} was not seen in every fill" for k in np.flatnonzero(blind)]
     steps = moved[along[1:]] / np.maximum(moved[along[:-1]], 1e-9)
     return RigFinding(
@@ -304,9 +297,8 @@ def _judge(log: RigLog, valve: int, fill: tuple[float, float], bends: Array) -> 
         short = 1.0 - rise / wanted
         opening = _mean(log.opening[(log.time > fill[1] - LEVEL) & (log.time <= fill[1])])[valve]
         if short > LEAKS or opening > OPEN:
-            said = f"it leaks or is fed too little: {100 * short:.0f} % below its command"
-            is_open = f", its inlet {100 * opening:.0f} % open" if np.isfinite(opening) else ""
-            problems.append(said + is_open)
+            below = f"{100 * short:.0f} % below its command, its inlet {100 * opening:.0f} % open"
+            problems.append(f"it leaks or is fed too little: {below}")
         later = (log.time > fill[1] + VENT - LEVEL) & (log.time < fill[1] + VENT)
         left = _mean(log.measured[later])[sensor] - levels[sensor]
         if left > STAYS * rise:
@@ -342,29 +334,25 @@ def _largest(changes: Array, least: float) -> tuple[int | None, float, float]:
 
 def _compare(valves: Sequence[ValveFinding], count: int) -> tuple[list[str], list[str]]:
     """Return why valves contradict each other, and what else is worth a warning."""
-    contradictions: list[str] = []
-    warnings: list[str] = []
+    contradictions, warnings = list[str](), list[str]()
+    bent, read = defaultdict(list), defaultdict(list)
     for each in valves:
+        bent[each.chamber].append(str(each.valve + 1))
+        read[each.sensor].append(str(each.valve + 1))
         for said in each.problems:
             grave = each.segment is None or "more than one" in said
             (contradictions if grave else warnings).append(f"valve {each.valve + 1}: {said}")
     for chamber in range(2 * count):
         moved = f"segment {chamber // 2 + 1} to the {SIDES[1 - 2 * (chamber % 2)]}"
-        by = [str(each.valve + 1) for each in valves if each.chamber == chamber]
-        if len(by) > 1:
-            contradictions.append(
-                f"valves {' and '.join(by)} both bend {moved}: the hose of one of them is in the "
-                "wrong port of the limb"
-            )
+        by = " and ".join(bent[chamber])
+        if len(bent[chamber]) > 1:
+            contradictions.append(f"valves {by} both bend {moved}: a hose is in the wrong port")
         elif not by:
             contradictions.append(f"no valve bends {moved}")
     for sensor in range(2 * count):
-        by = [str(each.valve + 1) for each in valves if each.sensor == sensor]
-        if len(by) > 1:
-            contradictions.append(
-                f"sensor {sensor + 1} answers to valves {' and '.join(by)}: look at its cable and "
-                "at the ports of its board"
-            )
-        elif by and by != [str(sensor + 1)]:
-            warnings.append(f"sensor {sensor + 1} reads valve {by[0]}: are their cables swapped?")
+        by = " and ".join(read[sensor])
+        if len(read[sensor]) > 1:
+            contradictions.append(f"sensor {sensor + 1} answers to valves {by}: look at its cable")
+        elif by and by != str(sensor + 1):
+            warnings.append(f"sensor {sensor + 1} reads valve {by}: are their cables swapped?")
     return contradictions, warnings

@@ -47,9 +47,9 @@ class LimbTwinNode(Node):
             at_least=0.0, at_most=2.0, read_only=False,
         )  # fmt: skip
         wiring = read(
-            "wiring", [0], "chamber of each valve, from 1; minus: it bends the other way; 0: own"
+            "wiring", [1, 2, 3, 4], "chamber of each valve; minus: it bends the other way"
         )
-        self._wiring = None if list(wiring) == [0] else Wiring(tuple(map(int, wiring)))
+        self._wiring = Wiring(tuple(map(int, wiring)))
         check_overrides(self)
         self._lock = threading.Lock()
         self._pressures: np.ndarray | None = None
@@ -117,10 +117,7 @@ class LimbTwinNode(Node):
             if self._pressures is None:
                 # The board starts vented, so its lowest chamber tells the air pressure of the room.
                 self._twin.atmosphere = float(pressures.min())
-            atmosphere = self._twin.atmosphere
-            self._pressures = (
-                pressures if self._wiring is None else self._wiring.felt(pressures, atmosphere)
-            )
+            self._pressures = self._wiring.felt(pressures, self._twin.atmosphere)
             self._received_at = time.monotonic()
             self._messages += 1
         self._bad_message = ""

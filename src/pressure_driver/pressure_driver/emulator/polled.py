@@ -6,19 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from pressure_driver.emulator.device import BoardCommand, BoardProtocol, BoardReading
-from pressure_driver.protocols import modbus, pneudrive
-from pressure_driver.protocols.festo import (
-    ACKNOWLEDGE,
-    BOTH_VALVES,
-    FIRST_INPUT,
-    FIRST_OUTPUT,
-    INACTIVE,
-    LARGEST_SETPOINT,
-    PASCAL_PER_MILLIBAR,
-    REGULATE,
-    RUNNING,
-    slot_word,
-)
+from pressure_driver.protocols import festo, modbus, pneudrive
 
 if TYPE_CHECKING:
     from pressure_driver.settings import EmulatorSettings
@@ -45,17 +33,17 @@ class Slot:
     def tell(self, word: int) -> None:
         """Take over the first register of the slot."""
         mode, control = word & 0x3F, word >> 6
-        if mode in (ACKNOWLEDGE, INACTIVE):
-            self.mode, self.state = INACTIVE, TO_BE_CONFIGURED
-        elif (mode, control, self.mode) == (REGULATE, BOTH_VALVES, INACTIVE):
-            self.mode, self.state, self._started_at = REGULATE, NOT_READY, None
+        if mode in (festo.ACKNOWLEDGE, festo.INACTIVE):
+            self.mode, self.state = festo.INACTIVE, TO_BE_CONFIGURED
+        elif (mode, control, self.mode) == (festo.REGULATE, festo.BOTH_VALVES, festo.INACTIVE):
+            self.mode, self.state, self._started_at = festo.REGULATE, NOT_READY, None
 
     def look(self, time: float) -> None:
         """Go on with the start (time since boot [s])."""
         if self.state == NOT_READY:
             self._started_at = time if self._started_at is None else self._started_at
             if time - self._started_at >= SLOT_START_TIME:
-                self.state = RUNNING
+                self.state = festo.RUNNING
 
 
 class FestoBoard(BoardProtocol):
@@ -92,20 +80,14 @@ class FestoBoard(BoardProtocol):
         first, count = modbus.BLOCK.unpack(data[:4].ljust(4, b"\0"))
         if function == modbus.READ:
             return BoardCommand("read", place, sequence=number, text=f"{first} {count}")
-        words, offset = modbus.to_words(data[5:]), first - FIRST_OUTPUT
+        words, offset = modbus.to_words(data[5:]), first - festo.FIRST_OUTPUT
         inside = 0 <= offset <= len(self._outputs) - count
         if function == modbus.WRITE and inside and len(words) == count:
             self._outputs[offset : offset + count] = words
             for slot, word in zip(self.slots, self._outputs[0::3], strict=False):
                 slot.tell(word)
-            return BoardCommand(
-                "setpoint",
-                place,
-                pressure=self._setpoints(),
-                valid_for=BUS_PATIENCE,
-                sequence=number,
-                text=f"{first} {count}",
-            )
+            told = self._setpoints()
+            return BoardCommand("setpoint", place, told, BUS_PATIENCE, number, f"{first} {count}")
         self.rejected += 1
         problem = ILLEGAL_ADDRESS if function == modbus.WRITE else ILLEGAL_FUNCTION
         return BoardCommand("refused", place, sequence=number, text=f"{function} {problem}")
@@ -114,8 +96,10 @@ class FestoBoard(BoardProtocol):
         values = [v for place, v in enumerate(self._outputs) if place % 3 or not self.slots]
         millibar = (modbus.signed(value) for value in values)
         # Regulators of an MPA terminal that are told less than nothing open wide.
-        wild = 0 if self.slots else LARGEST_SETPOINT
-        return tuple(PASCAL_PER_MILLIBAR * (value if value >= 0 else wild) for value in millibar)
+        wild = 0 if self.slots else festo.LARGEST_SETPOINT
+        return tuple(
+            festo.PASCAL_PER_MILLIBAR * (value if value >= 0 else wild) for value in millibar
+        )
 
     def target(self, pressure: Sequence[float], time: float) -> Sequence[float]:
         """Return setpoints of slots that run; the others are vented."""
@@ -124,22 +108,20 @@ class FestoBoard(BoardProtocol):
         for slot in self.slots:
             slot.look(time)
         return [
-            value if self.slots[chamber // 2].state == RUNNING else 0.0
+            value if self.slots[chamber // 2].state == festo.RUNNING else 0.0
             for chamber, value in enumerate(pressure)
         ]
 
     def _inputs(self, reading: BoardReading) -> list[int]:
-        measured = [
-            round((pressure - reading.atmosphere) / PASCAL_PER_MILLIBAR)
-            for pressure in reading.chamber_pressure
-        ]
+        gauge = (pressure - reading.atmosphere for pressure in reading.chamber_pressure)
+        measured = [round(value / festo.PASCAL_PER_MILLIBAR) for value in gauge]
         if not self.slots:
             pairs = zip(measured, self._outputs, strict=True)
             return [word for value, told in pairs for word in (value, told, 0)]
         words: list[int] = []
         for place, slot in enumerate(self.slots):
             slot.look(reading.time)
-            words += [slot_word(slot.mode, slot.state), *measured[2 * place : 2 * place + 2]]
+            words += [festo.slot_word(slot.mode, slot.state), *measured[2 * place : 2 * place + 2]]
         return words
 
     def reply(self, command: BoardCommand, reading: BoardReading) -> bytes:
@@ -149,7 +131,7 @@ class FestoBoard(BoardProtocol):
             return modbus.encode(number, first | modbus.FAILED, bytes([second]))
         if command.kind == "setpoint":
             return modbus.encode(number, modbus.WRITE, modbus.BLOCK.pack(first, second))
-        words, offset = self._inputs(reading), first - FIRST_INPUT
+        words, offset = self._inputs(reading), first - festo.FIRST_INPUT
         if not 0 <= offset <= len(words) - second:
             return modbus.encode(number, modbus.READ | modbus.FAILED, bytes([ILLEGAL_ADDRESS]))
         data = modbus.to_bytes(words[offset : offset + second])
@@ -170,8 +152,8 @@ class PneudriveBoard(BoardProtocol):
         self._frames = pneudrive.Frames(chamber_count)
 
     def configure(self, settings: EmulatorSettings) -> None:
-        """Take over the range of the sensors."""
-        self._frames.sensor_range = settings.sensor_range
+        """Take over the board's number and the range of its sensors."""
+        self._frames.configure(settings)
 
     def decode(self, data: bytes) -> list[BoardCommand]:
         """Return targets."""

@@ -200,10 +200,12 @@ class HostProtocol(ABC):
     """[Pa] of one step of its readings, where that is coarser than their noise."""
     clock: Callable[[], float]
     """[s] steady."""
+    room: Callable[[], float]
+    """[Pa] absolute, of the atmosphere, where the wire wants absolute pressures."""
 
     def __init__(self, chamber_count: int = 4) -> None:
         self.chamber_count = chamber_count
-        self.clock = time.monotonic
+        self.clock, self.room = time.monotonic, lambda: STANDARD_ATMOSPHERE
         self.rejected = 0
         """Frames or lines that were damaged and thrown away."""
         self.last_damaged = ""
@@ -223,30 +225,26 @@ class HostProtocol(ABC):
         """Return what a board must be sent after the port has opened."""
 
     @abstractmethod
-    def setpoint(
-        self, gauge: Sequence[float], atmosphere: float, valid_for: float
-    ) -> tuple[bytes, int | None]:
+    def setpoint(self, gauge: Sequence[float]) -> tuple[bytes, int | None]:
         """Encode one command.
 
         Args:
             gauge: (2M,) [Pa] of each valve, within the driver's limits.
-            atmosphere: [Pa] absolute, to add where the wire wants absolute pressures.
-            valid_for: [s] after which a board with a watchdog vents by itself.
 
         Returns:
             The bytes, and the number that the board's echo will carry (None: it has no numbers).
         """
 
-    def vent(self, atmosphere: float) -> tuple[bytes, int | None]:
+    def vent(self) -> tuple[bytes, int | None]:
         """Encode the command that opens every chamber to the atmosphere, or regulates to it."""
-        return self.setpoint([0.0] * self.chamber_count, atmosphere, 0.0)
+        return self.setpoint([0.0] * self.chamber_count)
 
-    def emergency(self, atmosphere: float) -> bytes:
+    def emergency(self) -> bytes:
         """Return what empties a board in any state, for a process that knows nothing about it.
 
         It is complete after any half-sent bytes.
         """
-        return self.separator + self.vent(atmosphere)[0]
+        return self.separator + self.vent()[0]
 
     def follow_up(self) -> bytes:
         """Return what is to be sent at once because of what has been decoded."""

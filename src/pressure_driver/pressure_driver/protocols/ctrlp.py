@@ -82,17 +82,12 @@ class CtrlpHost(LineHost):
         """Echoes on, kPa, ramps between setpoints, reports at 20 Hz."""
         return b"\nECHO;1\nUNITS;1\nMODE;3\nTIME;50\nON\n"
 
-    def setpoint(
-        self,
-        gauge: Sequence[float],
-        atmosphere: float,  # noqa: ARG002 - the wire carries gauge pressures
-        valid_for: float,  # noqa: ARG002 - the board has no watchdog
-    ) -> tuple[bytes, int | None]:
+    def setpoint(self, gauge: Sequence[float]) -> tuple[bytes, int | None]:
         """Encode one gauge pressure a channel in kPa, to 1 Pa."""
         numbers = ";".join(f"{value / PASCAL_PER_KILOPASCAL:.3f}" for value in gauge)
         return f"SET;{RAMP_TIME:.3f};{numbers}\n".encode(), None
 
-    def vent(self, atmosphere: float) -> tuple[bytes, int | None]:  # noqa: ARG002
+    def vent(self) -> tuple[bytes, int | None]:
         """Zero gauge pressure on every channel, without a ramp."""
         return ("SET;0.000" + ";0.000" * self.chamber_count + "\n").encode(), None
 

@@ -66,20 +66,15 @@ class EzloopHost(LineHost):
         """A line end, which finishes whatever an earlier program left half-sent."""
         return b"\n"
 
-    def setpoint(
-        self,
-        gauge: Sequence[float],
-        atmosphere: float,
-        valid_for: float,  # noqa: ARG002 - the board has no watchdog
-    ) -> tuple[bytes, int | None]:
+    def setpoint(self, gauge: Sequence[float]) -> tuple[bytes, int | None]:
         """Encode differences as pairs of absolute pressures, to 1 Pa.
 
         A pair that would pass 1250 hPa is sent lower as a pair: the board only reads differences.
         """
-        values: list[float] = []
+        values, room = list[float](), self.room() / PASCAL_PER_HECTOPASCAL
         for pair in zip(gauge[0::2], gauge[1::2], strict=True):
             sizes = [value / PASCAL_PER_HECTOPASCAL for value in pair]
-            low = min(atmosphere / PASCAL_PER_HECTOPASCAL, LARGEST_WIRE_VALUE - max(sizes))
+            low = min(room, LARGEST_WIRE_VALUE - max(sizes))
             low = math.floor(low * 100.0) / 100.0
             values += [low + round(size, 2) for size in sizes]
         return ("<" + ",".join(f"{value:.2f}" for value in values) + ">\n").encode(), None

@@ -25,19 +25,7 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from pressure_driver.protocols import BoardFailure, Echo, Event, HostProtocol, Telemetry
-from pressure_driver.protocols.modbus import (
-    BLOCK,
-    FAILED,
-    READ,
-    WRITE,
-    ModbusFrame,
-    ModbusReader,
-    encode,
-    signed,
-    to_bytes,
-    to_words,
-)
+from pressure_driver.protocols import BoardFailure, Echo, Event, HostProtocol, Telemetry, modbus
 
 if TYPE_CHECKING:
     from pressure_driver.settings import Settings
@@ -82,7 +70,7 @@ class FestoHost(HostProtocol):
     def __init__(self, chamber_count: int = 4) -> None:
         super().__init__(chamber_count)
         self._motion_terminal = True
-        self._frames = ModbusReader()
+        self._frames = modbus.ModbusReader()
         self._transaction = 0
         self.reset()
 
@@ -116,19 +104,13 @@ class FestoHost(HostProtocol):
             self._acknowledging = self._motion_terminal
         return b""
 
-    def setpoint(
-        self,
-        gauge: Sequence[float],
-        atmosphere: float,  # noqa: ARG002 - the wire carries gauge pressures
-        valid_for: float,  # noqa: ARG002 - the bus node has a patience of its own
-    ) -> tuple[bytes, int | None]:
+    def setpoint(self, gauge: Sequence[float]) -> tuple[bytes, int | None]:
         """Encode one write of all setpoints to 1 mbar; its answer brings the question."""
-        values = [
-            min(max(round(value / PASCAL_PER_MILLIBAR), 0), LARGEST_SETPOINT) for value in gauge
-        ]
+        millibar = (round(value / PASCAL_PER_MILLIBAR) for value in gauge)
+        values = [min(max(value, 0), LARGEST_SETPOINT) for value in millibar]
         return self._write(values, self._acknowledging), self._transaction
 
-    def emergency(self, atmosphere: float) -> bytes:  # noqa: ARG002
+    def emergency(self) -> bytes:
         """Regulate to the room's pressure, also where slots are being acknowledged."""
         return self._write([0] * self.chamber_count, False)
 
@@ -145,16 +127,11 @@ class FestoHost(HostProtocol):
         """Encode one write of setpoints [mbar], in each slot behind its mode."""
         words = list(values)
         if self._motion_terminal:
-            mode = slot_word(ACKNOWLEDGE, FIRST_VALVE)
-            if not acknowledge:
-                mode = slot_word(REGULATE, BOTH_VALVES)
-            words = [
-                word
-                for left, right in zip(values[0::2], values[1::2], strict=True)
-                for word in (mode, left, right)
-            ]
-        head = BLOCK.pack(FIRST_OUTPUT, len(words)) + bytes([2 * len(words)])
-        return encode(self._next(), WRITE, head + to_bytes(words))
+            task = (ACKNOWLEDGE, FIRST_VALVE) if acknowledge else (REGULATE, BOTH_VALVES)
+            for place in range(0, len(words) * 3 // 2, 3):
+                words.insert(place, slot_word(*task))
+        head = modbus.BLOCK.pack(FIRST_OUTPUT, len(words)) + bytes([2 * len(words)])
+        return modbus.encode(self._next(), modbus.WRITE, head + modbus.to_bytes(words))
 
     # ----------------------------------------------------------------------- from the terminal
 
@@ -169,23 +146,22 @@ class FestoHost(HostProtocol):
         self.rejected += self._frames.rejected - before
         return events
 
-    def _interpret(self, frame: ModbusFrame) -> list[Event]:
-        if frame.function == WRITE and len(frame.data) == BLOCK.size:
-            block = BLOCK.pack(FIRST_INPUT, INPUTS * self._places)
-            self._follow_up = encode(self._next(), READ, block)
+    def _interpret(self, frame: modbus.ModbusFrame) -> list[Event]:
+        if frame.function == modbus.WRITE and len(frame.data) == modbus.BLOCK.size:
+            block = modbus.BLOCK.pack(FIRST_INPUT, INPUTS * self._places)
+            self._follow_up = modbus.encode(self._next(), modbus.READ, block)
             return [Echo(frame.transaction)]
-        if frame.function in (READ | FAILED, WRITE | FAILED) and len(frame.data) == 1:
-            asked = "read" if frame.function == READ | FAILED else "write"
-            return [
-                BoardFailure(
-                    f"refused: a {asked} of registers, exception {frame.data[0]}; look at "
-                    "'terminal' and 'segment_count'"
-                )
-            ]
+        if (
+            frame.function in (modbus.READ | modbus.FAILED, modbus.WRITE | modbus.FAILED)
+            and len(frame.data) == 1
+        ):
+            asked = "read" if frame.function == modbus.READ | modbus.FAILED else "write"
+            said = f"refused: a {asked} of registers, exception {frame.data[0]}"
+            return [BoardFailure(f"{said}; look at 'terminal' and 'segment_count'")]
         size = 2 * INPUTS * self._places
-        if frame.function != READ or len(frame.data) != size + 1 or frame.data[0] != size:
+        if frame.function != modbus.READ or len(frame.data) != size + 1 or frame.data[0] != size:
             return []
-        words = to_words(frame.data[1:])
+        words = modbus.to_words(frame.data[1:])
         return self._slots(words) if self._motion_terminal else self._regulators(words)
 
     def _slots(self, words: Sequence[int]) -> list[Event]:
@@ -219,6 +195,6 @@ class FestoHost(HostProtocol):
         if self._sound:
             self._acknowledging = False
             self._started_at = -math.inf  # whatever fails next is started again at once
-        gauge = (PASCAL_PER_MILLIBAR * signed(word) for word in pressures)
+        gauge = (PASCAL_PER_MILLIBAR * modbus.signed(word) for word in pressures)
         readings = tuple(self.assumed_atmosphere + value for value in gauge)
         return [*events, Telemetry(chamber_pressure=readings)]

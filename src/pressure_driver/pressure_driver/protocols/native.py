@@ -13,6 +13,7 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import TYPE_CHECKING
 
 from cobs import cobs
 
@@ -28,6 +29,9 @@ from pressure_driver.protocols import (
     Telemetry,
 )
 
+if TYPE_CHECKING:
+    from pressure_driver.settings import Settings
+
 VERSION = 1
 HEADER = struct.Struct("<BBH")
 HELLO_BODY = struct.Struct("<BiiIB")
@@ -37,6 +41,8 @@ LONGEST_FRAME = 256
 """[bytes] as coded; a longer one is garbage."""
 LARGEST_GAUGE = 1_000_000
 """[Pa] A frame with more is refused."""
+VALIDITY = 250
+"""[ms] for which a setpoint holds, where nothing else is said."""
 LONGEST_VALIDITY = 60_000
 """[ms] A setpoint may stay valid at most this long."""
 
@@ -151,6 +157,11 @@ class NativeHost(HostProtocol):
         self._frames = FrameSplitter()
         self._sequence = 0
         self._board_time: int | None = None
+        self._validity = VALIDITY
+
+    def configure(self, settings: Settings) -> None:
+        """Take over how long a command holds."""
+        self._validity = round(1000.0 * settings.command_validity)
 
     def _next(self) -> int:
         self._sequence = (self._sequence + 1) & 0xFFFF
@@ -160,19 +171,14 @@ class NativeHost(HostProtocol):
         """A zero byte, which ends whatever was half-sent, and HELLO."""
         return b"\0" + encode(FrameType.HELLO, self._next())
 
-    def setpoint(
-        self,
-        gauge: Sequence[float],
-        atmosphere: float,  # noqa: ARG002 - the wire carries gauge pressures
-        valid_for: float,
-    ) -> tuple[bytes, int | None]:
+    def setpoint(self, gauge: Sequence[float]) -> tuple[bytes, int | None]:
         """Encode one gauge pressure a chamber, and how long they hold."""
-        body = SETPOINT_HEAD.pack(round(valid_for * 1000.0))
+        body = SETPOINT_HEAD.pack(self._validity)
         body += struct.pack(f"<{len(gauge)}i", *map(round, gauge))
         sequence = self._next()
         return encode(FrameType.SETPOINT, sequence, body), sequence
 
-    def vent(self, atmosphere: float) -> tuple[bytes, int | None]:  # noqa: ARG002
+    def vent(self) -> tuple[bytes, int | None]:
         """Encode VENT, which holds until the next SETPOINT."""
         sequence = self._next()
         return encode(FrameType.VENT, sequence), sequence

@@ -2,7 +2,7 @@
 
 One layout serves both directions: five numbers of 16 bits, big-endian::
 
-    address (0xFFFF, which is that of board 0), four pressures in counts
+    address (0xFFFF less the board's number, 0 to 3), four pressures in counts
 
 To the board they are targets; its answer holds what it measures, and is sent before the targets are
 stored. A gauge pressure p of sensors with the range R is 1024 (0.1 + 0.8 p / R) counts. There is no
@@ -19,10 +19,11 @@ from typing import TYPE_CHECKING
 from pressure_driver.protocols import Echo, Event, FrameBuffer, HostProtocol, Telemetry
 
 if TYPE_CHECKING:
-    from pressure_driver.settings import Settings
+    from pressure_driver.settings import EmulatorSettings, Settings
 
 FRAME = struct.Struct(">5H")
-ADDRESS = 0xFFFF
+FIRST_ADDRESS = 0xFFFF
+"""Of board 0; the others count down from it."""
 VALVES = 4
 LARGEST_COUNT = 1023
 NOMINAL_RANGE = 689_500.0
@@ -40,14 +41,22 @@ class Frames(FrameBuffer):
     def __init__(self, chamber_count: int) -> None:
         super().__init__()
         self._count = chamber_count
-        self.sensor_range = NOMINAL_RANGE
-        """[Pa]"""
+        self._address, self._range = FIRST_ADDRESS, NOMINAL_RANGE
+
+    def configure(self, settings: Settings | EmulatorSettings) -> None:
+        """Take over the board's number and the range of its sensors."""
+        self._address, self._range = FIRST_ADDRESS - settings.device, settings.sensor_range
+
+    @property
+    def resolution(self) -> float:
+        """[Pa] of a count."""
+        return self._range / (_STEPS * _SPAN)
 
     def encode(self, gauge: Sequence[float]) -> bytes:
         """Return a frame of gauge pressures [Pa]; valves without a chamber have none."""
         padded = [*gauge, *[0.0] * (VALVES - self._count)]
-        counts = [round(_STEPS * (_ZERO + _SPAN * value / self.sensor_range)) for value in padded]
-        return FRAME.pack(ADDRESS, *(min(max(count, 0), LARGEST_COUNT) for count in counts))
+        counts = [round(_STEPS * _ZERO + value / self.resolution) for value in padded]
+        return FRAME.pack(self._address, *(min(max(count, 0), LARGEST_COUNT) for count in counts))
 
     def feed(self, data: bytes) -> list[tuple[int, tuple[float, ...]]]:
         """Return (place of the first byte, gauge pressures [Pa]) of complete frames."""
@@ -55,8 +64,8 @@ class Frames(FrameBuffer):
         self.kept += data
         while len(self.kept) >= FRAME.size:
             address, *counts = FRAME.unpack_from(self.kept)
-            if address == ADDRESS and max(counts) <= LARGEST_COUNT:
-                pressures = [self.sensor_range * (n / _STEPS - _ZERO) / _SPAN for n in counts]
+            if address == self._address and max(counts) <= LARGEST_COUNT:
+                pressures = [self.resolution * (n - _STEPS * _ZERO) for n in counts]
                 found.append((self.position, tuple(pressures[: self._count])))
                 self.take(FRAME.size)
             else:
@@ -76,16 +85,16 @@ class PneudriveHost(HostProtocol):
     )
     separator = b""
     echoes = True
-    resolution = NOMINAL_RANGE / (_STEPS * _SPAN)
 
     def __init__(self, chamber_count: int = 4) -> None:
         super().__init__(chamber_count)
         self._frames = Frames(chamber_count)
+        self.resolution = self._frames.resolution
 
     def configure(self, settings: Settings) -> None:
-        """Take over the range of the sensors."""
-        self._frames.sensor_range = settings.sensor_range
-        self.resolution = settings.sensor_range / (_STEPS * _SPAN)
+        """Take over the board's number and the range of its sensors."""
+        self._frames.configure(settings)
+        self.resolution = self._frames.resolution
 
     def reset(self) -> None:
         """Forget a half-received frame."""
@@ -95,12 +104,7 @@ class PneudriveHost(HostProtocol):
         """Nothing: the board speaks when it is spoken to."""
         return b""
 
-    def setpoint(
-        self,
-        gauge: Sequence[float],
-        atmosphere: float,  # noqa: ARG002 - the wire carries gauge pressures
-        valid_for: float,  # noqa: ARG002 - the board has no watchdog
-    ) -> tuple[bytes, int | None]:
+    def setpoint(self, gauge: Sequence[float]) -> tuple[bytes, int | None]:
         """Encode the targets."""
         return self._frames.encode(gauge), None
 

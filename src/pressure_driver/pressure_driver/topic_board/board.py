@@ -8,6 +8,7 @@ from dataclasses import replace
 
 from pressure_driver.emulator.device import BoardReading
 from pressure_driver.emulator.firmware import NativeBoard
+from pressure_driver.following import valves_of
 from pressure_driver.settings import SettingError, TopicBoardSettings
 
 STALE = 0.2
@@ -28,27 +29,24 @@ class Scale:
 
     def __init__(self, settings: TopicBoardSettings) -> None:
         count = 2 * settings.segment_count
-        named = [part.strip() for part in settings.order.split(",")]
-        if sorted(named) != sorted(map(str, range(count))):
+        try:
+            self._order = valves_of(settings.order, count, first=0)
+        except ValueError as error:
             raise SettingError(
                 f"parameter 'order' is '{settings.order}': name each of the chambers 0 to "
                 f"{count - 1} once, as in '0,1,2,3'"
-            )
-        self.order = [int(part) for part in named]
+            ) from error
         self._scale, self._offset = settings.scale, settings.offset
         self._room = settings.atmosphere if settings.absolute else 0.0
 
     def to_topic(self, gauge: Sequence[float]) -> list[float]:
         """Return what a lab is told, in its order, for gauge pressures (2M,) [Pa]."""
-        values = [(pressure + self._room) * self._scale + self._offset for pressure in gauge]
-        return [values[chamber] for chamber in self.order]
+        return [(gauge[k] + self._room) * self._scale + self._offset for k in self._order]
 
     def from_topic(self, told: Sequence[float]) -> list[float]:
         """Return gauge pressures (2M,) [Pa] for what a lab tells, in its order."""
-        gauge = [0.0] * len(self.order)
-        for chamber, value in zip(self.order, told, strict=True):
-            gauge[chamber] = (value - self._offset) / self._scale - self._room
-        return gauge
+        gauge = [(value - self._offset) / self._scale - self._room for value in told]
+        return [gauge[self._order.index(chamber)] for chamber in range(len(gauge))]
 
 
 class WatchedBoard:

@@ -13,7 +13,7 @@ from geometry_msgs.msg import Pose, PoseArray, PoseStamped
 from apriltag_tracker.bodies.body_map import BodyMap
 from apriltag_tracker.bodies.forms import message_type, topics_of
 from apriltag_tracker.synthetic.nodes.listening import ShapeListener
-from apriltag_tracker.synthetic.poses import MocapFaults, SyntheticMocap
+from apriltag_tracker.synthetic.poses import UPRIGHT, MocapFaults, SyntheticMocap
 from apriltag_tracker.synthetic.shapes import Shape
 from limb_interfaces import qos, stamps
 from limb_interfaces.parameters import check_overrides, declare
@@ -43,9 +43,10 @@ class SyntheticPosesNode(ShapeListener):
             delay=number("delay", 0.0, "by which stamps are late [s]", 0.5, -0.5),
         )
         tilt = number("tilt", 0.0, "of the plane of motion against the floor [rad]", 2.0, -2.0)
+        up = str(declare(self, "up", "z", "axis that points up", choices=tuple(UPRIGHT)))
         check_overrides(self)
         bodies = BodyMap.from_yaml(str(body_map))
-        self._mocap = SyntheticMocap(bodies, faults, tilt=tilt, seed=int(seed))
+        self._mocap = SyntheticMocap(bodies, faults, tilt=tilt, seed=int(seed), up=up)
         kind = message_type(form)
         self._outputs = {
             name: self.create_publisher(kind, place, qos.STATES)
