@@ -33,6 +33,8 @@ _INDEPENDENT = 0.8
 """Time after which an instant says something new of the share [s]."""
 _DEVIATIONS = 1.5
 """Number of its standard deviations that are taken off the share."""
+_RISES = 1.5
+"""Time in which the share may rise from none to all: a sudden correction makes the limb swing [s]."""
 _QUICK = 1.0
 """Root mean square rate of a motion, over that of its bend, from which on nothing is trusted before
 it was seen [1/s]."""
@@ -105,7 +107,8 @@ class Benefit:
         doubt = max(lacked - share * brought, 0.0) / (asked + self._prior)
         others = max(watched / _INDEPENDENT - 1.0, 1e-9)
         share -= _DEVIATIONS * math.sqrt(doubt / others)
-        self.share = min(max(float(share), 0.0), 1.0)
+        most = min(1.0, self.share + passed / _RISES)
+        self.share = min(max(float(share), 0.0), most)
 
 
 def _step(passed: float, time: float) -> float:
