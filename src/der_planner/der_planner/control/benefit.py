@@ -34,7 +34,7 @@ _INDEPENDENT = 0.8
 _DEVIATIONS = 1.5
 """Number of its standard deviations that are taken off the share."""
 _RISES = 1.5
-"""Time in which the share may rise from none to all: a sudden correction makes the limb swing [s]."""
+"""Time in which the share may rise from none to all: a sudden correction makes a limb swing [s]."""
 _QUICK = 1.0
 """Root mean square rate of a motion, over that of its bend, from which on nothing is trusted before
 it was seen [1/s]."""
