@@ -140,8 +140,8 @@ def test_an_interrupted_experiment_with_loads_and_feedback_vents_and_goes_on(exp
         assert entry["valid_fraction"] > 0.9
         assert 0.0 < entry["mean_error_m"] <= entry["max_error_m"] < 0.1
         assert entry["checks"]["tracker_rms_m"] < 1e-3
-        assert entry["checks"]["board_out_of_order"] == 0
-    assert entries[0]["checks"]["board_lost"] == 0
+    # With feedback, a late revision is looked for among the commands to come, and may be like one.
+    assert entries[0]["checks"]["board_lost"] == entries[0]["checks"]["board_out_of_order"] == 0
     feedback = entries[1]["extra"]["feedback"]
     assert feedback["latency_median_s"] > 0.0
     assert max(feedback["correction_rms_pa"]) > 10.0
