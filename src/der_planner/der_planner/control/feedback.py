@@ -51,7 +51,7 @@ class Feedback:
         plan: what is played; its limb, reference and commands are used.
         reaction: to something that touches the limb: "warn", "hold", "yield" or "vent". A limb that
             was never calibrated is not known well enough to yield: it warns.
-        force_limit: force that is allowed then, with "yield" [N]; None: none more than there is.
+        force_limit: force that is allowed then, with "yield" [N]; None: that of the plan.
 
     Attributes:
         plan: as given.

@@ -1,15 +1,14 @@
 """What is done about a touch: warn, hold, yield or vent.
 
+Against what touches, the tip stays behind whatever is corrected. From before a touch is sure,
+`yield` leaves corrections what they were; once it has ended they come back slowly.
+
 A touch is worth an effective pressure ℓ per segment (`Touch.pressure`): bending further against it
 raises the force. A change δu of the pressures in the chambers does so as far as −ℓ·δu > 0. While
-something is touched, `yield` gives no command u with −ℓ·u above the least that the plan has asked
-for and the chambers have held since: what the plan and its corrections want is moved to the nearest
-command on that side. From before a touch is sure, corrections stay what they were, lest they press
-by another segment. What
-corrections pressed before the touch was noticed is taken back, the limb retreats as the plan does,
-does not follow when the plan presses again, and is free once the touch has ended; corrections then
-come back slowly. With a limit in N the bound is where the force would reach it: against something
-that does not move, pressures raise the force at a place with compliance C_p by
+something is touched, `yield` gives no command u with −ℓ·u above that of the plan: what is wanted is
+moved to the nearest command on that side. To retreat farther than the plan would do harm where a
+touch is false. With a limit in N the bound is where the force, with its deviation, would reach it:
+against something that does not move, pressures raise the force at a place with compliance C_p by
 −f̂ᵀ (∂p/∂u) δu / (f̂ᵀ C_p f̂).
 """
 
@@ -41,7 +40,7 @@ class Reaction:
     Args:
         model: rod of the limb.
         kind: one of `KINDS`. `vent` holds, and says with `vents` that the limb is to be vented.
-        limit: force that is allowed [N]; None: none more than there is.
+        limit: force that is allowed [N]; None: that of the plan.
 
     Raises:
         ValueError: another kind, or a limit that is no force.
@@ -86,8 +85,7 @@ class Reaction:
         if self.kind != "yield":
             return
         harder = -touch.pressure / max(float(np.linalg.norm(touch.pressure)), _SMALLEST)
-        self._held = min(self._held, chambers, planned, key=lambda each: float(harder @ each))
-        self._bound = harder, float(harder @ self._held)
+        self._bound = harder, float(harder @ planned)
         if self.limit is not None and np.isfinite([touch.place, *touch.force]).all():
             self._bound = self._limited(touch, chambers, self.limit)
 

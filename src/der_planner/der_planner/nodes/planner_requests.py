@@ -156,7 +156,7 @@ def read_parameters(node: Node) -> PlannerOptions:
         ),
         force_limit=read(
             "force_limit", 0.0, "force [N] that the reaction 'yield' allows; 0: none more than "
-            "there is when the touch is noticed", at_least=0.0, at_most=100.0
+            "that of the plan", at_least=0.0, at_most=100.0
         ),
         obstacles=Obstacles.from_yaml(in_the_way) if in_the_way else None,
     )  # fmt: skip
