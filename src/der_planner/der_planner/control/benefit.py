@@ -33,13 +33,18 @@ _INDEPENDENT = 0.8
 """Time after which an instant says something new of the share [s]."""
 _DEVIATIONS = 1.5
 """Number of its standard deviations that are taken off the share."""
-_RISES = 1.5
-"""Time in which the share may rise from none to all: a sudden correction makes a limb swing [s]."""
+_RISES, _RISES_QUICK = 1.5, 3.0
+"""Time in which the share may rise from none to all, and how much longer that takes in a quick
+motion: a sudden correction makes a limb swing [s]."""
 _QUICK = 1.0
 """Root mean square rate of a motion, over that of its bend, from which on nothing is trusted before
 it was seen [1/s]."""
 _TRUST, _TRUSTED = 0.008, 10.0
 """What the slowest motion begins with: √(Σ e² / 1 s) over the length, and for how long [s]."""
+_OUTLYING = 9.0
+"""An instant counts as much as one that leaves so many times the usual squared error, at most."""
+_LEAST_TRUST = 0.1
+"""Added to the trust in two motions before they are compared."""
 _DOUBT = 0.002
 """√(P / 1 s), over the limb's length."""
 
@@ -68,15 +73,21 @@ class Benefit:
         moved = nominal.bend - nominal.bend.mean(axis=0)
         rates = np.gradient(nominal.bend, CONTROL_PERIOD, axis=0)
         quick = float(np.sum(rates**2) / max(np.sum(moved**2), 1e-12)) / _QUICK**2
-        trust, worth = max(0.0, 1.0 - quick), (_TRUST * nominal.model.limb.length) ** 2
-        self._sums = trust * np.array([worth, worth, worth, _TRUSTED])
+        self._trust = max(0.0, 1.0 - quick)
+        self._rises = _RISES + (1.0 - self._trust) * _RISES_QUICK
+        worth = (_TRUST * nominal.model.limb.length) ** 2
+        self._sums = self._trust * np.array([worth, worth, worth, _TRUSTED])
         self._prior = (_DOUBT * nominal.model.limb.length) ** 2
         self._seen = -1
         self.share = 0.0
 
     def take_over(self, other: Benefit) -> None:
-        """Begin with what the corrections of another plan of this limb have brought."""
-        self._sums, self.share = other._sums, other.share
+        """Begin with what the corrections of another plan of this limb have brought.
+
+        What a slower motion has told counts as much less as this one is trusted less at first.
+        """
+        kept = min(1.0, (self._trust + _LEAST_TRUST) / (other._trust + _LEAST_TRUST))
+        self._sums, self.share = kept * other._sums, other.share
         self._pressure = other._pressure
 
     def sent(self, k: int, sent: Array, wanted: Array) -> None:
@@ -101,13 +112,17 @@ class Benefit:
             now = self._smooth[stage]
         alone, wanted = now
         fresh = np.array([-alone @ wanted, wanted @ wanted, alone @ alone, 1.0])
-        self._sums = self._sums + passed * fresh - _step(passed, _FORGET) * self._sums
+        # Swings after a push would drown for long what was brought before and after.
+        usual = max(self._sums[2] / max(self._sums[3], 1.0), self._prior)
+        fresh *= min(1.0, _OUTLYING * usual / max(float(fresh[2]), usual))
+        counts = min(passed, _SMOOTH)  # of a time in which nothing was seen little is known
+        self._sums = self._sums + counts * fresh - _step(counts, _FORGET) * self._sums
         brought, asked, lacked, watched = self._sums
         share = brought / (asked + self._prior)
         doubt = max(lacked - share * brought, 0.0) / (asked + self._prior)
         others = max(watched / _INDEPENDENT - 1.0, 1e-9)
         share -= _DEVIATIONS * math.sqrt(doubt / others)
-        most = min(1.0, self.share + passed / _RISES)
+        most = min(1.0, self.share + passed / self._rises)
         self.share = min(max(float(share), 0.0), most)
 
 

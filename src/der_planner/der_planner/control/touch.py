@@ -58,7 +58,9 @@ _RUBS = 0.3
 _LEAST_ALONG = 0.01
 """Force along the limb that is expected anyway, a standard deviation [N]."""
 _EFFECT_WRONG = 0.1
-"""Standard deviation of what a weight is said to do, over that."""
+"""Standard deviation of what a weight or a force is said to do, over that."""
+_UNEVEN = 0.02
+"""The same of how far the tip moves beside its bend, over how far the bend moves it."""
 _SETTLES = 0.3
 """Time in which a payload pulls as much as later: it comes at once, contact grows [s]."""
 _WEIGHED = 0.7
@@ -161,7 +163,7 @@ class TouchSense:
         away, variance, distance = self._away(lacking, self.free, self._learned)
         touched = distance > (_RELEASED if before.touched else 1.0)
         if touched and not before.touched:
-            touched = not self._lets_go(lacking)
+            touched = not self._lets_go(lacking, away.covariance)
             away, variance, distance = self._away(lacking, self.free, self._learned)
         if distance < _RELEASED:
             self._calm = lacking.time
@@ -209,13 +211,19 @@ class TouchSense:
         distance = float(value @ np.linalg.solve(noise, value)) / self.threshold
         return replace(lacking, value=value, covariance=noise), variance, distance
 
-    def _lets_go(self, lacking: Lacking) -> bool:
+    def _lets_go(self, lacking: Lacking, noise: Array) -> bool:
         """Return whether what seems to begin is the end of a touch, and go back to its free level.
 
-        What was left of the force, when it seemed to be over, has been learned meanwhile.
+        What was left of the force, when it seemed to be over, has been learned meanwhile. The noise
+        is today's: a level of which little was known would explain any touch.
+
+        Args:
+            lacking: of the model.
+            noise: (M + 2, M + 2) covariance of what is away from the newest free level.
         """
         for place, earlier in enumerate(self._earlier):
-            if self._away(lacking, *earlier)[2] < _RELEASED:
+            value = self._away(lacking, *earlier)[0].value
+            if value @ np.linalg.solve(noise, value) < _RELEASED * self.threshold:
                 self.free, self._learned = copy.deepcopy(earlier)
                 del self._earlier[place + 1 :]
                 self._recent.clear()
@@ -273,7 +281,11 @@ def locate(model: RodModel, lacking: Lacking, places: Array) -> Touch:
     """
     axes = _axes(model, lacking.bend_angles, places)
     effect = effects(model, lacking.bend_angles, places) @ axes
-    weight = np.linalg.inv(lacking.covariance)
+    bent = compliance(model, lacking.bend_angles, places[-1:]).bend_by_pressure
+    moved = model.kinematics.tip_jacobians(lacking.bend_angles) @ bent @ lacking.value[:-2]
+    doubt = _EFFECT_WRONG * lacking.value
+    doubt[-2:] = _UNEVEN * np.linalg.norm(moved)
+    weight = np.linalg.inv(lacking.covariance + np.diag(doubt**2))
     seen = np.swapaxes(effect, 1, 2) @ weight
     square, pull = seen @ effect, seen @ lacking.value
     across = pull[:, 1] / (square[:, 1, 1] + 1.0 / _LARGEST_FORCE**2)
