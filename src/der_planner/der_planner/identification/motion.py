@@ -31,7 +31,7 @@ BENDS_ON = np.deg2rad(6.0)
 AWAY = 3
 """Rows between those that count and those where the bend is slower, or turns round."""
 TURNS = (0.05, 0.2)
-"""Bends over which the elements of friction turn round beside the one that does so at once [rad]."""
+"""Bends over which elements of friction turn round, beside one that does so at once [rad]."""
 PIECES = 12
 """Pieces of a segment. Inertia bends it most where it begins."""
 SHAPES = 3
@@ -128,7 +128,8 @@ def _inertia(limb: Limb, angles: Array, stiffness: Array) -> Array:
         owner += [-1, *[i] * PIECES]
     length, masses, of = np.array(lengths), np.array(lengths) * density, np.array(owner)
     for item in limb.masses:
-        masses[min(np.searchsorted(np.cumsum(length), item.arc_length), len(of) - 1)] += item.mass
+        at = int(np.searchsorted(np.cumsum(length), item.arc_length))
+        masses[min(at, len(of) - 1)] += item.mass
     even = np.where(of < 0, 0.0, angles[:, of] / PIECES)
     turned, means = even, np.zeros_like(angles)
     for _ in range(SHAPES):
