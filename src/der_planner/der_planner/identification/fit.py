@@ -128,14 +128,14 @@ def _fit(
         warnings.append(f"the chambers' lag keeps its old value: {error}")
     offset = 0.0 if air is None else air.offset
     prepared = replace(recorded, pressure=recorded.pressure - offset)
-    fitted = _fit_bends_and_lengths(limb, prepared, groups)
+    fitted = _fit_bends_and_lengths(limb, prepared, groups, by_motion=hung is None)
     warnings += filter(None, [lengths_at_their_end(limb, fitted.known)])
     if hung is not None:
         change, deviation = hung.stiffness_change(fitted.known, fitted.limb)
         weighed = fitted.free.told("log_stiffness", change, deviation)
         fitted = _again(fitted, weighed, prepared)
     unknowns, correlation = told(fitted.problem, fitted.values)
-    kept, said = untold_stiffness(fitted.free, unknowns)
+    kept, said = untold_stiffness(fitted.free, unknowns, bool(fitted.measured.places))
     without_kept = _again(fitted, fitted.free.only(~kept), prepared) if kept.any() else fitted
     if without_kept is not fitted:
         left = tuple(kept_unknowns(fitted.free.only(kept)))
@@ -143,6 +143,7 @@ def _fit(
         unknowns, correlation = told(fitted.problem, fitted.values)
         unknowns += left
         warnings.append(said)
+    unknowns += tuple(kept_unknowns(fitted.measured))
     warnings += at_bounds(fitted.free, fitted.values)
     found = _calibrated(fitted, limb, air, recorded)
     warnings += filter(None, [nearly_buckling(found)])
@@ -170,7 +171,8 @@ def _fit(
 class _Fitted(NamedTuple):
     """A limb with its lengths, the problem solved on it, what it left, and the limb found.
 
-    What the log did not tell is in ``kept``, pairs of segment and term.
+    What was measured before is in ``measured``, what the log did not tell in ``kept``, pairs of
+    segment and term.
     """
 
     known: Limb
@@ -180,6 +182,7 @@ class _Fitted(NamedTuple):
     values: Array
     remaining: Array
     limb: Limb
+    measured: FreeTerms
     kept: frozenset[tuple[int, int]] = frozenset()
 
     @property
@@ -188,7 +191,9 @@ class _Fitted(NamedTuple):
         return self.problem.free
 
 
-def _fit_bends_and_lengths(prior: Limb, prepared: Prepared, groups: Collection[str]) -> _Fitted:
+def _fit_bends_and_lengths(
+    prior: Limb, prepared: Prepared, groups: Collection[str], *, by_motion: bool
+) -> _Fitted:
     """Fit the lengths first, or in turn with the bend angles where weight bends the limb unevenly.
 
     The lengths follow from tips and bend angles only if it is known how unevenly each segment
@@ -197,7 +202,8 @@ def _fit_bends_and_lengths(prior: Limb, prepared: Prepared, groups: Collection[s
     """
     loaded = prior.weighs_in_plane
     lengths = fit_geometry(prior, prepared.log) if not loaded else None
-    fitted = _fit_bends(lengths.limb if lengths else prior, prepared, groups, lengths)
+    known = lengths.limb if lengths else prior
+    fitted = _fit_bends(known, prepared, groups, lengths, by_motion=by_motion)
     for _ in range(MOST_PASSES if loaded else 0):
         uneven, lacking = unevenness(fitted.limb, prepared, NODES)
         lengths = fit_geometry(prior, prepared.log, uneven)
@@ -220,6 +226,8 @@ def _fit_bends(
     lengths: GeometryFit | None,
     before: _Fitted | None = None,
     tips: UnevenTips | None = None,
+    *,
+    by_motion: bool = False,
 ) -> _Fitted:
     """Fit the rod to the bend angles.
 
@@ -230,6 +238,7 @@ def _fit_bends(
         lengths: of the limb.
         before: a fit of the same terms to begin at; None: in closed form from the log's statics.
         tips: fit to them, too; None: to the bend angles alone.
+        by_motion: take the stiffness from `stiffness_in_motion` where that is sure of it.
     """
     names = {term.name for term in TERMS if term.group in ("linear", *groups)}
     if "mass" in groups:
@@ -238,8 +247,15 @@ def _fit_bends(
         # Without weight, or with an unknown mass, it is one scale with the stiffness.
         names.discard("log_inertia")
     free = FreeTerms.of(known, names, without(values_of(known, starts=True), groups))
-    if not known.weighs_in_plane:
-        free = free.told("log_stiffness", *stiffness_in_motion(known, prepared))
+    sure = np.zeros(len(free.terms), dtype=bool)
+    if by_motion and not known.weighs_in_plane:
+        change, deviation = stiffness_in_motion(known, prepared)
+        free = free.told("log_stiffness", change, deviation)
+        sure |= [
+            term.name == "log_stiffness" and np.isfinite(deviation[segment])
+            for (segment, _), term in zip(free.places, free.terms, strict=True)
+        ]
+    free, measured = free.only(~sure), free.only(sure)
     problem = BendFit(free, RodModel(known, NODES), [prepared], tips.rows if tips else None)
     if before is None:
         start = free.at_places(_static_start(free, prepared))
@@ -247,9 +263,8 @@ def _fit_bends(
         start = before.values
         problem.weigh(before.problem.errors)
     values = problem.solve(_followed(problem, free, start))
-    return _Fitted(
-        known, lengths, tips, problem, values, problem.remaining(values), free.limb_with(values)
-    )
+    remaining, limb = problem.remaining(values), free.limb_with(values)
+    return _Fitted(known, lengths, tips, problem, values, remaining, limb, measured)
 
 
 def _static_start(free: FreeTerms, prepared: Prepared) -> Array:
@@ -261,7 +276,6 @@ def _static_start(free: FreeTerms, prepared: Prepared) -> Array:
     rows = prepared.usable
     pressure, bend = prepared.pressure[rows], prepared.bend[rows]
     values, weight = free.values.copy(), Material(free.limb).weight_torques(bend)
-    stiffness = COLUMN["log_stiffness"]
     doubt = EVEN_ERROR / COMPLIANCE_SPREAD * np.sqrt(len(bend))
     for index, segment in enumerate(free.limb.segments):
         spread = float(np.std(pressure[:, index]))
@@ -274,8 +288,8 @@ def _static_start(free: FreeTerms, prepared: Prepared) -> Array:
         seen = np.append(bend[:, index], doubt)
         gain, compliance, rest = np.linalg.lstsq(design, seen, rcond=None)[0]
         stiffer = np.clip(-np.log(max(compliance, 1e-3)), -LARGEST_CHANGE, LARGEST_CHANGE)
-        places = [COLUMN["gain"], COLUMN["rest_angle"], stiffness]
-        values[index, places] = gain / spread, rest, values[index, stiffness] + stiffer
+        places = [COLUMN[term] for term in ("gain", "rest_angle", "log_stiffness")]
+        values[index, places] = gain / spread, rest, stiffer
     return values
 
 
@@ -333,8 +347,6 @@ def _with_arcs(
     free = FreeTerms.of(found, names)
     # What the log does not tell of the rod it does not tell of the arcs either.
     free = free.only(np.array([place not in fitted.kept for place in free.places]))
-    if not found.weighs_in_plane:
-        free = free.told("log_stiffness", *stiffness_in_motion(found, prepared, even=True))
     problem = BendFit(free, ArcModel(found), [prepared])
     problem.weigh(fitted.problem.errors)
     if not problem.search.follows(free.unknowns.prior):
