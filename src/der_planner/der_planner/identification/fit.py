@@ -135,7 +135,7 @@ def _fit(
         weighed = fitted.free.told("log_stiffness", change, deviation)
         fitted = _again(fitted, weighed, prepared)
     unknowns, correlation = told(fitted.problem, fitted.values)
-    kept, said = untold_stiffness(fitted.free, unknowns, bool(fitted.measured.places))
+    kept, said = untold_stiffness(fitted.free, unknowns)
     without_kept = _again(fitted, fitted.free.only(~kept), prepared) if kept.any() else fitted
     if without_kept is not fitted:
         left = tuple(kept_unknowns(fitted.free.only(kept)))
@@ -247,14 +247,10 @@ def _fit_bends(
         # Without weight, or with an unknown mass, it is one scale with the stiffness.
         names.discard("log_inertia")
     free = FreeTerms.of(known, names, without(values_of(known, starts=True), groups))
-    sure = np.zeros(len(free.terms), dtype=bool)
     if by_motion and not known.weighs_in_plane:
-        change, deviation = stiffness_in_motion(known, prepared)
-        free = free.told("log_stiffness", change, deviation)
-        sure |= [
-            term.name == "log_stiffness" and np.isfinite(deviation[segment])
-            for (segment, _), term in zip(free.places, free.terms, strict=True)
-        ]
+        free = free.told("log_stiffness", *stiffness_in_motion(known, prepared))
+    spread = np.array([TERMS[place].spread for _, place in free.places])
+    sure = free.unknowns.spread < spread
     free, measured = free.only(~sure), free.only(sure)
     problem = BendFit(free, RodModel(known, NODES), [prepared], tips.rows if tips else None)
     if before is None:

@@ -66,20 +66,23 @@ def stiffness_in_motion(limb: Limb, log: Prepared) -> tuple[Array, Array]:
     """
     bend, pressure = _smooth(log.bend), _smooth(log.pressure)
     rate = np.gradient(bend, CONTROL_PERIOD, axis=0)
-    ways = [log.usable[:, None] & (way * rate > BENDS_ON) for way in (1, -1)]
     apart = np.ones((2 * AWAY + 1, 1), dtype=bool)
-    bends_on = binary_erosion(ways[0], apart) | binary_erosion(ways[1], apart)
+    ways = [binary_erosion(way * rate > BENDS_ON, apart) for way in (1, -1)]
+    counts = (ways[0] | ways[1]) & binary_erosion(log.usable, apart[:, 0])[:, None]
     change, deviation = np.zeros(limb.segment_count), np.full(limb.segment_count, np.inf)
     for _ in range(PASSES):
         inertia = _inertia(limb, bend, change)
         for i, segment in enumerate(limb.segments):
+            rows = counts[:, i]
+            if rows.sum() < LEAST_ROWS:
+                continue
             angle, own, exact = bend[:, i], pressure[:, i], np.ascontiguousarray(log.bend[:, i])
             friction = [np.sign(rate[:, i]), *(_smooth(dahl(exact, turn)) for turn in TURNS)]
             bent = [angle, np.ones_like(angle), angle**3, angle * np.abs(own), np.abs(own)]
             beside = [pressure[:, j] for j in (i - 1, i + 1) if 0 <= j < limb.segment_count]
             columns = np.column_stack([inertia[:, i], *bent, *friction, *beside, rate])
-            (inert, elastic), error = _factors(columns[bends_on[:, i]], own[bends_on[:, i]])
-            if bends_on[:, i].sum() > LEAST_ROWS and min(inert, elastic) > 0.0:
+            (inert, elastic), error = _factors(columns[rows], own[rows])
+            if min(inert, elastic) > 0.0:
                 change[i] = np.log(segment.length * elastic / inert / segment.bending_stiffness)
                 sigma = np.hypot(error / inert, METHOD_ERROR)
                 deviation[i] = sigma if sigma < SURE else np.inf
@@ -111,20 +114,19 @@ def _inertia(limb: Limb, bend: Array, change: Array) -> Array:
         change: (M,) of the logarithm of the stiffness, by which inertia bends a segment unevenly.
     """
     longer = limb.connector_length * (1.0 - 1.0 / limb.segment_count)
-    pieces = tuple(
-        replace(segment, length=(segment.length + longer) / PIECES, damping=0.0)
-        for segment in limb.segments
-        for _ in range(PIECES)
-    )
-    arcs = ArcModel(replace(limb, segments=pieces, pcc_segments=(), connector_length=0.0))
+    undamped = [replace(item, damping=0.0, material_damping=0.0) for item in limb.segments]
+    pieces = [
+        replace(s, length=(s.length + longer) / PIECES) for s in undamped for _ in range(PIECES)
+    ]
+    arcs = ArcModel(replace(limb, segments=tuple(pieces), pcc_segments=(), connector_length=0.0))
     flexible = np.repeat(np.exp(-change), PIECES) / arcs.stiffness
     even = np.repeat(bend / PIECES, PIECES, axis=1)
     bent = even
     for _ in range(SHAPES):
         rate, acceleration = np.gradient(bent, CONTROL_PERIOD, axis=0), np.zeros_like(bent)
         acceleration[1:-1] = np.diff(bent, 2, axis=0) / CONTROL_PERIOD**2
-        resting = arcs.elastic_torque(bent) + arcs.stiffness * arcs.material_damping * rate
-        moments = arcs.gain * arcs.inverse_dynamics(bent, rate, acceleration) - resting
+        beyond = arcs.inverse_dynamics(bent, rate, acceleration) - arcs.static_pressure(bent)
+        moments = arcs.gain * beyond
         means: Array = moments.reshape(len(bend), -1, PIECES).mean(axis=2)
         bent = even - flexible * (moments - np.repeat(means, PIECES, axis=1))
     return means

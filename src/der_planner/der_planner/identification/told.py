@@ -32,9 +32,7 @@ EXPERIMENTS = {
 """What tells the terms of a group where a log does not, as the subject of a sentence."""
 
 
-def untold_stiffness(
-    free: FreeTerms, unknowns: Sequence[Unknown], others: bool = False
-) -> tuple[Mask, str]:
+def untold_stiffness(free: FreeTerms, unknowns: Sequence[Unknown]) -> tuple[Mask, str]:
     """Return which unknowns (P,) keep what was known before the log, and the sentence for it.
 
     Stiffness that the log does not tell takes up what the model lacks in friction and creep. Where
@@ -44,7 +42,7 @@ def untold_stiffness(
     untold = stiff & np.array([unknown.untold for unknown in unknowns], dtype=bool)
     if not untold.any():
         return untold, ""
-    if np.array_equal(untold, stiff) and not others:
+    if untold.sum() == free.limb.segment_count:
         return np.array([term.group == "dynamics" for term in free.terms]), (
             "the log is too slow to tell the stiffness apart from the gain: stiffness and damping "
             "keep their old values; steps, a sweep or a known weight (--weight) would tell them"
