@@ -15,7 +15,9 @@ def test_stiffness_is_found_though_friction_stops_each_swing():
     run, chain = calibration_run(16_800.0), LinkChain(1)
     log = chain.play(run.time, run.differential_pressure, run=1).log()
     compliance = np.sum(1.0 / chain._stiffness.reshape(2, -1), axis=1)
-    true = np.log([s.length / c / s.bending_stiffness for s, c in zip(LIMB.segments, compliance)])
+    true = np.log(
+        [s.length / c / s.bending_stiffness for s, c in zip(LIMB.segments, compliance, strict=True)]
+    )
     change, deviation = stiffness_in_motion(LIMB, prepare(log, LIMB))
     assert deviation.max() < 0.1
     assert np.abs(change - true).max() < 0.12
