@@ -38,6 +38,7 @@ from der_planner.identification.log import (
     Prepared,
     prepare,
 )
+from der_planner.identification.motion import stiffness_in_motion
 from der_planner.identification.report import FitReport
 from der_planner.identification.told import at_bounds, kept_unknowns, told, untold_stiffness
 from der_planner.identification.weight import HungWeight
@@ -127,7 +128,7 @@ def _fit(
         warnings.append(f"the chambers' lag keeps its old value: {error}")
     offset = 0.0 if air is None else air.offset
     prepared = replace(recorded, pressure=recorded.pressure - offset)
-    fitted = _fit_bends_and_lengths(limb, prepared, groups)
+    fitted = _fit_bends_and_lengths(limb, prepared, groups, by_motion=hung is None)
     warnings += filter(None, [lengths_at_their_end(limb, fitted.known)])
     if hung is not None:
         change, deviation = hung.stiffness_change(fitted.known, fitted.limb)
@@ -142,6 +143,7 @@ def _fit(
         unknowns, correlation = told(fitted.problem, fitted.values)
         unknowns += left
         warnings.append(said)
+    unknowns += tuple(kept_unknowns(fitted.measured))
     warnings += at_bounds(fitted.free, fitted.values)
     found = _calibrated(fitted, limb, air, recorded)
     warnings += filter(None, [nearly_buckling(found)])
@@ -169,7 +171,8 @@ def _fit(
 class _Fitted(NamedTuple):
     """A limb with its lengths, the problem solved on it, what it left, and the limb found.
 
-    What the log did not tell is in ``kept``, pairs of segment and term.
+    What was measured before is in ``measured``, what the log did not tell in ``kept``, pairs of
+    segment and term.
     """
 
     known: Limb
@@ -179,6 +182,7 @@ class _Fitted(NamedTuple):
     values: Array
     remaining: Array
     limb: Limb
+    measured: FreeTerms
     kept: frozenset[tuple[int, int]] = frozenset()
 
     @property
@@ -187,7 +191,9 @@ class _Fitted(NamedTuple):
         return self.problem.free
 
 
-def _fit_bends_and_lengths(prior: Limb, prepared: Prepared, groups: Collection[str]) -> _Fitted:
+def _fit_bends_and_lengths(
+    prior: Limb, prepared: Prepared, groups: Collection[str], *, by_motion: bool
+) -> _Fitted:
     """Fit the lengths first, or in turn with the bend angles where weight bends the limb unevenly.
 
     The lengths follow from tips and bend angles only if it is known how unevenly each segment
@@ -196,7 +202,8 @@ def _fit_bends_and_lengths(prior: Limb, prepared: Prepared, groups: Collection[s
     """
     loaded = prior.weighs_in_plane
     lengths = fit_geometry(prior, prepared.log) if not loaded else None
-    fitted = _fit_bends(lengths.limb if lengths else prior, prepared, groups, lengths)
+    known = lengths.limb if lengths else prior
+    fitted = _fit_bends(known, prepared, groups, lengths, by_motion=by_motion)
     for _ in range(MOST_PASSES if loaded else 0):
         uneven, lacking = unevenness(fitted.limb, prepared, NODES)
         lengths = fit_geometry(prior, prepared.log, uneven)
@@ -219,6 +226,8 @@ def _fit_bends(
     lengths: GeometryFit | None,
     before: _Fitted | None = None,
     tips: UnevenTips | None = None,
+    *,
+    by_motion: bool = False,
 ) -> _Fitted:
     """Fit the rod to the bend angles.
 
@@ -229,6 +238,7 @@ def _fit_bends(
         lengths: of the limb.
         before: a fit of the same terms to begin at; None: in closed form from the log's statics.
         tips: fit to them, too; None: to the bend angles alone.
+        by_motion: take the stiffness from `stiffness_in_motion` where that is sure of it.
     """
     names = {term.name for term in TERMS if term.group in ("linear", *groups)}
     if "mass" in groups:
@@ -237,6 +247,11 @@ def _fit_bends(
         # Without weight, or with an unknown mass, it is one scale with the stiffness.
         names.discard("log_inertia")
     free = FreeTerms.of(known, names, without(values_of(known, starts=True), groups))
+    if by_motion and not known.weighs_in_plane:
+        free = free.told("log_stiffness", *stiffness_in_motion(known, prepared))
+    spread = np.array([TERMS[place].spread for _, place in free.places])
+    sure = free.unknowns.spread < spread
+    free, measured = free.only(~sure), free.only(sure)
     problem = BendFit(free, RodModel(known, NODES), [prepared], tips.rows if tips else None)
     if before is None:
         start = free.at_places(_static_start(free, prepared))
@@ -244,9 +259,8 @@ def _fit_bends(
         start = before.values
         problem.weigh(before.problem.errors)
     values = problem.solve(_followed(problem, free, start))
-    return _Fitted(
-        known, lengths, tips, problem, values, problem.remaining(values), free.limb_with(values)
-    )
+    remaining, limb = problem.remaining(values), free.limb_with(values)
+    return _Fitted(known, lengths, tips, problem, values, remaining, limb, measured)
 
 
 def _static_start(free: FreeTerms, prepared: Prepared) -> Array:
