@@ -57,11 +57,17 @@ ANGLE_ERROR = np.deg2rad(0.3)
 """Error of a predicted bend angle that is taken for granted before its residual is known [rad]."""
 CORRELATION = 20.0
 """Rows over which an error of the model stays the same (1 s), and which part slow from fast."""
-LEAST_ERRORS = np.array([[ANGLE_ERROR], [np.deg2rad(0.1)]])
-"""Least slow and fast errors (2, 1) for which bend angles are weighed: of any model, and of tags
-[rad]."""
+LEAST_ERRORS = np.array([[ANGLE_ERROR], [np.deg2rad(0.1)], [ANGLE_ERROR]])
+"""Least errors (3, 1) for which bend angles are weighed: slow, fast ones, and slow ones of a limb
+that was shaken; of any model, and of tags [rad]."""
 BENDS_ON = np.deg2rad(2.0)
 """Rate of the bend that pressures ask for from which on friction does not turn round [rad/s]."""
+SHAKES = 0.5
+"""The same rate from which on a limb swings so much that what its friction held lets go [rad/s]."""
+SHAKEN = 4.0
+"""Time for which that is so afterwards [s]."""
+SHAKEN_WORSE = 4.0
+"""Slow errors then over those elsewhere, at least."""
 SOFTNESS = 3.0
 """Errors beyond this multiple of the usual one count less than their square."""
 ROUGH = 3e-2
@@ -325,11 +331,13 @@ class BendFit:
         self.free, self._model, self._logs, self._more_rows = free, model, logs, more_rows
         self._last: tuple[bytes, list[Predicted] | None] = (b"", None)
         self._bends_on = [_bends_on(free.limb, log) for log in logs]
-        self.weigh(np.full((2, free.limb.segment_count), ANGLE_ERROR))
+        self._shaken = [_shaken(free.limb, log) for log in logs]
+        self.weigh(np.full((3, free.limb.segment_count), ANGLE_ERROR))
 
     def weigh(self, errors: Array) -> None:
-        """Take errors (2, M) of bend angles for granted, slow and fast ones [rad]."""
+        """Take errors (3, M) of bend angles for granted, see `LEAST_ERRORS` [rad]."""
         self.errors = np.maximum(errors, 1e-3 * ANGLE_ERROR)
+        self.errors[2] = np.maximum(errors[2], SHAKEN_WORSE * errors[0])
         unknowns = self.free.unknowns
         self.search = LeastSquares(unknowns, self._rows, SOFTNESS / np.sqrt(CORRELATION))
 
@@ -372,12 +380,14 @@ class BendFit:
         if found is None:
             return None
         errors, slopes, scale = [], [], np.sqrt(CORRELATION)
-        for log, part, on in zip(self._logs, found, self._bends_on, strict=True):
+        masks = zip(self._logs, found, self._bends_on, self._shaken, strict=True)
+        for log, part, on, shaken in masks:
             rows = log.usable
             left = _apart(part.angles[rows] - log.log.bend_angles[rows])
             by = _apart(part.angles_by[rows])
-            usual = np.repeat(self.errors[:, None], rows.sum(), axis=1)
+            usual = np.repeat(self.errors[:2, None], rows.sum(), axis=1)
             usual[1, ~on[rows]] = self.errors[0]  # elsewhere fast errors count as slow ones do
+            usual[:, shaken[rows] & ~on[rows]] = self.errors[2]
             for error, change, weight in zip(left, by, 1.0 / (usual * scale), strict=True):
                 errors.append((weight * error).ravel())
                 slopes.append((weight[..., None] * change).reshape(-1, len(values)))
@@ -400,9 +410,9 @@ class BendFit:
         return np.concatenate(errors)
 
     def errors_left(self, values: Array) -> Array:
-        """Return the slow and fast errors (2, M) [rad] that values (P,) leave of the bend angles.
+        """Return the errors (3, M) [rad] that values (P,) leave, see `LEAST_ERRORS`.
 
-        They are as large as errors that stay the same for `CORRELATION` rows would have to be.
+        Slow ones are as large as errors that stay the same for `CORRELATION` rows would have to be.
         """
         remaining = self.remaining(values)
         usable = np.concatenate([log.usable for log in self._logs])
@@ -413,10 +423,9 @@ class BendFit:
         independent = slow.size / max(length, CORRELATION)
         left = max(independent - len(self.free.unknowns.prior), 0.5 * independent)
         longer = max(length / CORRELATION, 1.0) * independent / left
-        errors = np.empty((2, slow.shape[1]))
-        errors[0] = np.sqrt(longer * np.mean(slow**2))
-        errors[1] = np.sqrt(np.sum(fast**2, axis=0) / max(len(fast), 1))
-        return errors
+        shaken = np.concatenate(self._shaken)[usable]
+        parts = [longer * slow[~shaken] ** 2, fast**2, longer * slow[shaken] ** 2]
+        return np.sqrt([part.sum(axis=0) / max(len(part), 1) for part in parts])
 
     def excess(self, remaining: Array) -> float:
         """Return by how much the data's variance exceeds that of `ANGLE_ERROR` and `CORRELATION`.
@@ -475,6 +484,18 @@ def _apart(table: Array) -> tuple[Array, Array]:
 
 def _bends_on(limb: Limb, log: Prepared) -> NDArray[np.bool_]:
     """Return the rows (K,) around which the pressures bend all segments on, each in one way."""
-    rate = limb.static_gain * np.gradient(_apart(log.pressure)[0], CONTROL_PERIOD, axis=0)
+    rate = _bend_rate(limb, log, round(CORRELATION))
     on = log.usable & np.all(np.abs(rate) > BENDS_ON, axis=1)
     return np.asarray(binary_erosion(on, iterations=round(CORRELATION / 2)))
+
+
+def _shaken(limb: Limb, log: Prepared) -> NDArray[np.bool_]:
+    """Return the rows (K,) in which friction holds less than a model without swing says."""
+    jumps = np.any(np.abs(_bend_rate(limb, log, 5)) > SHAKES, axis=1)
+    return np.convolve(jumps, np.ones(round(SHAKEN / CONTROL_PERIOD)))[: len(jumps)] > 0.5
+
+
+def _bend_rate(limb: Limb, log: Prepared, rows: int) -> Array:
+    """Return the rate (K, M) of the bend that the pressures ask for, over some rows [rad/s]."""
+    pressure = uniform_filter1d(log.pressure, rows, axis=0, mode="nearest")
+    return limb.static_gain * np.gradient(pressure, CONTROL_PERIOD, axis=0)
