@@ -38,6 +38,7 @@ from der_planner.identification.log import (
     Prepared,
     prepare,
 )
+from der_planner.identification.motion import stiffness_in_motion
 from der_planner.identification.report import FitReport
 from der_planner.identification.told import at_bounds, kept_unknowns, told, untold_stiffness
 from der_planner.identification.weight import HungWeight
@@ -237,6 +238,8 @@ def _fit_bends(
         # Without weight, or with an unknown mass, it is one scale with the stiffness.
         names.discard("log_inertia")
     free = FreeTerms.of(known, names, without(values_of(known, starts=True), groups))
+    if not known.weighs_in_plane:
+        free = free.told("log_stiffness", *stiffness_in_motion(known, prepared))
     problem = BendFit(free, RodModel(known, NODES), [prepared], tips.rows if tips else None)
     if before is None:
         start = free.at_places(_static_start(free, prepared))
@@ -271,7 +274,7 @@ def _static_start(free: FreeTerms, prepared: Prepared) -> Array:
         gain, compliance, rest = np.linalg.lstsq(design, seen, rcond=None)[0]
         stiffer = np.clip(-np.log(max(compliance, 1e-3)), -LARGEST_CHANGE, LARGEST_CHANGE)
         places = [COLUMN[term] for term in ("gain", "rest_angle", "log_stiffness")]
-        values[index, places] = gain / spread, rest, stiffer
+        values[index, places] = gain / spread, rest, values[index, places[2]] + stiffer
     return values
 
 
