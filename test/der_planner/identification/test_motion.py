@@ -3,7 +3,7 @@
 import numpy as np
 from link_chain import LinkChain
 
-from der_planner.identification.excitation import calibration_run, waves
+from der_planner.identification.excitation import calibration_run
 from der_planner.identification.log import prepare
 from der_planner.identification.motion import stiffness_in_motion
 from der_planner.limb import Limb
@@ -21,10 +21,3 @@ def test_stiffness_is_found_though_friction_stops_each_swing():
     change, deviation = stiffness_in_motion(LIMB, prepare(log, LIMB))
     assert deviation.max() < 0.1
     assert np.abs(change - true).max() < 0.12
-
-
-def test_slow_motion_tells_no_stiffness():
-    pressure = waves(8000.0)
-    time = 0.05 * np.arange(len(pressure))
-    log = LinkChain(1).play(time, pressure, run=1).log()
-    assert np.isinf(stiffness_in_motion(LIMB, prepare(log, LIMB))[1]).all()

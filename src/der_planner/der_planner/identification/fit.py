@@ -128,7 +128,7 @@ def _fit(
         warnings.append(f"the chambers' lag keeps its old value: {error}")
     offset = 0.0 if air is None else air.offset
     prepared = replace(recorded, pressure=recorded.pressure - offset)
-    fitted = _fit_bends_and_lengths(limb, prepared, groups, by_motion=hung is None)
+    fitted = _fit_bends_and_lengths(limb, prepared, groups)
     warnings += filter(None, [lengths_at_their_end(limb, fitted.known)])
     if hung is not None:
         change, deviation = hung.stiffness_change(fitted.known, fitted.limb)
@@ -143,7 +143,6 @@ def _fit(
         unknowns, correlation = told(fitted.problem, fitted.values)
         unknowns += left
         warnings.append(said)
-    unknowns += tuple(kept_unknowns(fitted.measured))
     warnings += at_bounds(fitted.free, fitted.values)
     found = _calibrated(fitted, limb, air, recorded)
     warnings += filter(None, [nearly_buckling(found)])
@@ -171,8 +170,7 @@ def _fit(
 class _Fitted(NamedTuple):
     """A limb with its lengths, the problem solved on it, what it left, and the limb found.
 
-    What was measured before is in ``measured``, what the log did not tell in ``kept``, pairs of
-    segment and term.
+    What the log did not tell is in ``kept``, pairs of segment and term.
     """
 
     known: Limb
@@ -182,7 +180,6 @@ class _Fitted(NamedTuple):
     values: Array
     remaining: Array
     limb: Limb
-    measured: FreeTerms
     kept: frozenset[tuple[int, int]] = frozenset()
 
     @property
@@ -191,9 +188,7 @@ class _Fitted(NamedTuple):
         return self.problem.free
 
 
-def _fit_bends_and_lengths(
-    prior: Limb, prepared: Prepared, groups: Collection[str], *, by_motion: bool
-) -> _Fitted:
+def _fit_bends_and_lengths(prior: Limb, prepared: Prepared, groups: Collection[str]) -> _Fitted:
     """Fit the lengths first, or in turn with the bend angles where weight bends the limb unevenly.
 
     The lengths follow from tips and bend angles only if it is known how unevenly each segment
@@ -202,8 +197,7 @@ def _fit_bends_and_lengths(
     """
     loaded = prior.weighs_in_plane
     lengths = fit_geometry(prior, prepared.log) if not loaded else None
-    known = lengths.limb if lengths else prior
-    fitted = _fit_bends(known, prepared, groups, lengths, by_motion=by_motion)
+    fitted = _fit_bends(lengths.limb if lengths else prior, prepared, groups, lengths)
     for _ in range(MOST_PASSES if loaded else 0):
         uneven, lacking = unevenness(fitted.limb, prepared, NODES)
         lengths = fit_geometry(prior, prepared.log, uneven)
@@ -226,8 +220,6 @@ def _fit_bends(
     lengths: GeometryFit | None,
     before: _Fitted | None = None,
     tips: UnevenTips | None = None,
-    *,
-    by_motion: bool = False,
 ) -> _Fitted:
     """Fit the rod to the bend angles.
 
@@ -238,7 +230,6 @@ def _fit_bends(
         lengths: of the limb.
         before: a fit of the same terms to begin at; None: in closed form from the log's statics.
         tips: fit to them, too; None: to the bend angles alone.
-        by_motion: take the stiffness from `stiffness_in_motion` where that is sure of it.
     """
     names = {term.name for term in TERMS if term.group in ("linear", *groups)}
     if "mass" in groups:
@@ -247,11 +238,8 @@ def _fit_bends(
         # Without weight, or with an unknown mass, it is one scale with the stiffness.
         names.discard("log_inertia")
     free = FreeTerms.of(known, names, without(values_of(known, starts=True), groups))
-    if by_motion and not known.weighs_in_plane:
+    if not known.weighs_in_plane:
         free = free.told("log_stiffness", *stiffness_in_motion(known, prepared))
-    spread = np.array([TERMS[place].spread for _, place in free.places])
-    sure = free.unknowns.spread < spread
-    free, measured = free.only(~sure), free.only(sure)
     problem = BendFit(free, RodModel(known, NODES), [prepared], tips.rows if tips else None)
     if before is None:
         start = free.at_places(_static_start(free, prepared))
@@ -259,8 +247,9 @@ def _fit_bends(
         start = before.values
         problem.weigh(before.problem.errors)
     values = problem.solve(_followed(problem, free, start))
-    remaining, limb = problem.remaining(values), free.limb_with(values)
-    return _Fitted(known, lengths, tips, problem, values, remaining, limb, measured)
+    return _Fitted(
+        known, lengths, tips, problem, values, problem.remaining(values), free.limb_with(values)
+    )
 
 
 def _static_start(free: FreeTerms, prepared: Prepared) -> Array:
@@ -285,7 +274,7 @@ def _static_start(free: FreeTerms, prepared: Prepared) -> Array:
         gain, compliance, rest = np.linalg.lstsq(design, seen, rcond=None)[0]
         stiffer = np.clip(-np.log(max(compliance, 1e-3)), -LARGEST_CHANGE, LARGEST_CHANGE)
         places = [COLUMN[term] for term in ("gain", "rest_angle", "log_stiffness")]
-        values[index, places] = gain / spread, rest, stiffer
+        values[index, places] = gain / spread, rest, values[index, places[2]] + stiffer
     return values
 
 

@@ -46,10 +46,8 @@ OUTLYING = 3.0
 """Errors beyond this multiple of the median one count less than their square."""
 ROUNDS = 8
 """Times that they are weighed."""
-METHOD_ERROR = 0.05
-"""Error of the logarithm of the stiffness by shape, smoothing and partly sticking segments."""
-SURE = 0.15
-"""Deviation up to which it is told: what a model's friction does to a swing is worse."""
+SURE = 0.14
+"""Deviation of its logarithm up to which motion tells the stiffness."""
 _smooth = partial(gaussian_filter1d, sigma=SMOOTHED, axis=0)
 
 
@@ -84,8 +82,7 @@ def stiffness_in_motion(limb: Limb, log: Prepared) -> tuple[Array, Array]:
             (inert, elastic), error = _factors(columns[rows], own[rows])
             if min(inert, elastic) > 0.0:
                 change[i] = np.log(segment.length * elastic / inert / segment.bending_stiffness)
-                sigma = np.hypot(error / inert, METHOD_ERROR)
-                deviation[i] = sigma if sigma < SURE else np.inf
+                deviation[i] = error / inert if error < SURE * inert else np.inf
     return change, deviation
 
 

@@ -18,6 +18,8 @@ Mask = NDArray[np.bool_]
 UNTOLD = 0.8
 """Share of its prior spread above which the deviation of an unknown means that the log does not
 tell it."""
+STIFFNESS_ERROR = 0.05
+"""Least deviation of the logarithm of a stiffness: no model's friction is that of the limb."""
 EXPERIMENTS = {
     "linear": "slow pressures both ways on each segment, in the units of the log,",
     "asymmetry": "slow pressures both ways on each segment",
@@ -94,6 +96,9 @@ def told(problem: BendFit, values: Array) -> tuple[tuple[Unknown, ...], Array]:
     problem.weigh(problem.errors_left(values))
     covariance = problem.search.covariance(values)
     deviation = np.sqrt(np.diag(covariance))
+    correlation = covariance / np.outer(deviation, deviation)
+    stiff = [term.name == "log_stiffness" for term in free.terms]
+    deviation[stiff] = np.maximum(deviation[stiff], STIFFNESS_ERROR)
     at_bound = free.unknowns.at_bound(values)
     unknowns = tuple(
         Unknown(
@@ -108,4 +113,4 @@ def told(problem: BendFit, values: Array) -> tuple[tuple[Unknown, ...], Array]:
             free.terms, free.places, values, deviation, at_bound, strict=True
         )
     )
-    return unknowns, covariance / np.outer(deviation, deviation)
+    return unknowns, correlation
