@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from der_planner.arrays import Array
-from der_planner.identification.bends import COLUMN, TERMS, BendFit, FreeTerms
+from der_planner.identification.bends import TERMS, BendFit, FreeTerms
 from der_planner.identification.report import Unknown, readable
 from der_planner.limb import Term
 
@@ -44,7 +44,7 @@ def untold_stiffness(free: FreeTerms, unknowns: Sequence[Unknown]) -> tuple[Mask
     untold = stiff & np.array([unknown.untold for unknown in unknowns], dtype=bool)
     if not untold.any():
         return untold, ""
-    if untold.sum() == free.limb.segment_count:
+    if np.array_equal(untold, stiff):
         return np.array([term.group == "dynamics" for term in free.terms]), (
             "the log is too slow to tell the stiffness apart from the gain: stiffness and damping "
             "keep their old values; steps, a sweep or a known weight (--weight) would tell them"
@@ -57,11 +57,10 @@ def untold_stiffness(free: FreeTerms, unknowns: Sequence[Unknown]) -> tuple[Mask
 
 
 def kept_unknowns(free: FreeTerms) -> Iterator[Unknown]:
-    """Yield terms that a fit left as they were known before it, with the deviation of that."""
+    """Yield terms that the fit left as they were known before, with the deviation of that."""
     before = free.at_places(free.values)
     for term, (segment, _), value in zip(free.terms, free.places, before, strict=True):
-        untold = term.spread > UNTOLD * TERMS[COLUMN[term.name]].spread
-        yield Unknown(_name(term, segment), term.unit, float(value), term.spread, untold=untold)
+        yield Unknown(_name(term, segment), term.unit, float(value), term.spread, untold=True)
 
 
 def at_bounds(free: FreeTerms, values: Array) -> Iterator[str]:
