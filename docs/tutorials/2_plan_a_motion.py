@@ -16,7 +16,7 @@ from der_planner.model import Model
 from der_planner.planning import Motion, UnreachableError, plan
 from der_planner.twin.offline import play
 
-limb = Limb.default()
+limb = Limb.default()  # another: limb.to_yaml("mine.yaml"), edit, Limb.from_yaml("mine.yaml")
 print(f"{limb.segment_count} segments, {100 * limb.length:.1f} cm")
 
 # %%

@@ -4,7 +4,7 @@ From a log to a limb: identify, check, predict
 
 A limb is known by a run that moves it: pressures in, bend angles and tip out. Here the twin, a rod of
 another library with friction, creep and unequal chambers, stands in for the hardware. A log of your own
-is read by ``read_csv`` or ``read_bag`` instead, and the rest is the same.
+is read by ``read_csv(FILE, ColumnMap.from_yaml(MAP))`` or ``read_bag`` instead, and the rest is the same.
 """
 
 import matplotlib.pyplot as plt

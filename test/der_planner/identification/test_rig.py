@@ -126,7 +126,7 @@ def test_what_is_broken_is_named(straight):
 
     found = find_rig(dataclasses.replace(straight, places=still))
     assert any("valve 2: pressure but no motion" in each for each in found.contradictions)
-    assert "no valve bends segment 1 to the right" in found.contradictions
+    assert "no valve bends segment 0 to the right" in found.contradictions
 
     found = find_rig(dataclasses.replace(straight, measured=dead))
     assert any("valve 2: motion but no pressure" in each for each in found.warnings)
@@ -174,7 +174,7 @@ def test_logs_that_tell_nothing_are_refused(straight):
         ({"command": command}, "valve 4 was not filled"),
         ({"command": 0 * command}, "no log of a check"),
         ({"places": np.full_like(straight.places, np.nan)}, "nothing was seen"),
-        ({"arc_lengths": np.array([0.01, 0.02, 0.03, 0.2, 0.239])}, "half of segment 1"),
+        ({"arc_lengths": np.array([0.01, 0.02, 0.03, 0.2, 0.239])}, "half of segment 0"),
     ):
         with pytest.raises(RigError, match=said):
             find_rig(dataclasses.replace(straight, **changes))

@@ -15,9 +15,6 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
-from apriltag_tracker.bodies.body_map import BodyMap
-from apriltag_tracker.bodies.tracker import BodyTracker, PoseFrame
-from apriltag_tracker.tag_map import MapError
 from der_planner.arrays import Array
 from der_planner.bags.reader import BagError, BagReader
 from der_planner.bags.record import Columns, header_stamp
@@ -148,6 +145,11 @@ def bends_of(log: PoseLog, body_map: Path, time: Array) -> tuple[Array, Array]:
         LogError: the map cannot be read, names a body that the log has not, or the limb was never
             seen; says why.
     """
+    # Only who reads motion capture needs the tracker.
+    from apriltag_tracker.bodies.body_map import BodyMap  # noqa: PLC0415
+    from apriltag_tracker.bodies.tracker import BodyTracker, PoseFrame  # noqa: PLC0415
+    from apriltag_tracker.tag_map import MapError  # noqa: PLC0415
+
     try:
         bodies = BodyMap.from_yaml(body_map)
     except MapError as error:
@@ -238,6 +240,7 @@ QUESTIONS = {
 }
 """What to ask for each key of a map of columns."""
 _LISTS = ("commanded", "chambers", "angles", "tip")
+_NEEDED = ("time", "commanded", "chambers", "bodies", "angles")
 _OF_POSES = ("bodies", "poses_late")
 _OF_COLUMNS = ("angles", "angle_unit", "tip", "length_unit")
 
@@ -254,11 +257,16 @@ def ask_map(names: Sequence[str], path: Path, ask: Callable[[str], str] = input)
         OSError: the map cannot be written.
     """
     print("\n".join(f"  {k}: {name}" for k, name in enumerate(names)))
+    print("answer with numbers or names of columns, with commas between them")
     content: dict[str, Any] = {}
     for key, question in QUESTIONS.items():
         if key in (_OF_COLUMNS if "poses" in content else _OF_POSES):
             continue
-        words = ask(f"{question}: ").replace(",", " ").split()
+        words = list[str]()
+        while not words:
+            words = ask(f"{question}: ").replace(",", " ").split()
+            if key not in _NEEDED:
+                break
         is_column = key in _LISTS or key == "time"
         found = [names[int(each)] if is_column and each.isdigit() else each for each in words]
         if found:

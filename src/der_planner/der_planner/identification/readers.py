@@ -146,7 +146,10 @@ class ColumnMap:
         if wrong:
             said = "missing" if wrong[0] in missing else "unknown"
             keys = ", ".join(sorted(known))
-            raise LogError(f"column map {path}: {wrong[0]} is {said}; the keys are {keys}")
+            raise LogError(
+                f"column map {path}: {wrong[0]} is {said}; the keys are {keys}; commands that were "
+                "not logged may be the chambers once more"
+            )
         values: dict[str, Any] = {}
         for key, value in content.items():
             reading, expected = _KINDS.get(key, (str, "one word or name"))

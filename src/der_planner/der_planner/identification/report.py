@@ -125,7 +125,12 @@ class FitReport:
             )
         lines += self._air_lines() + self._geometry_lines() + self._load_lines()
         late, deviation = self.delay
-        if abs(late) > 3.0 * deviation:
+        if late < -3.0 * deviation:
+            lines.append(
+                f"what was seen is {-1e3 * late:.0f} ± {1e3 * deviation:.0f} ms early, as no camera "
+                "is: check the clocks of the log, and mass and lengths of the limb"
+            )
+        if late > 3.0 * deviation:
             lines.append(
                 f"what was seen is {1e3 * late:.0f} ± {1e3 * deviation:.0f} ms late: the trackers' "
                 f"parameter sensor_delay takes {late:.3f} s off their stamps. The fit is without "

@@ -109,7 +109,7 @@ class ValveFinding(NamedTuple):
         moves, reads = "moves nothing", "no sensor reads it"
         if self.segment is not None:
             angle = np.degrees(abs(self.bend))
-            moves = f"bends segment {self.segment + 1} to the {SIDES[self.side]} by {angle:.1f}°"
+            moves = f"bends segment {self.segment} to the {SIDES[self.side]} by {angle:.1f}°"
         if self.sensor is not None:
             reads = f"sensor {self.sensor + 1} reads {self.rise:.0f} Pa"
         lags = f"{1e3 * self.to_pressure:.0f} + {1e3 * self.to_motion:.0f} ms"
@@ -271,7 +271,7 @@ def _segment_ends(arcs: Array, lengths: Sequence[float]) -> list[int]:
     for index, (end, length) in enumerate(zip(np.cumsum(lengths), lengths, strict=True)):
         within = np.flatnonzero((arcs <= end + 0.05 * length) & (arcs > end - 0.5 * length))
         if not len(within):
-            raise RigError(f"no tag or body on the second half of segment {index + 1} was seen")
+            raise RigError(f"no tag or body on the second half of segment {index} was seen")
         found.append(int(within[-1]))
     return found
 
@@ -343,7 +343,7 @@ def _compare(valves: Sequence[ValveFinding], count: int) -> tuple[list[str], lis
             grave = each.segment is None or "more than one" in said
             (contradictions if grave else warnings).append(f"valve {each.valve + 1}: {said}")
     for chamber in range(2 * count):
-        moved = f"segment {chamber // 2 + 1} to the {SIDES[1 - 2 * (chamber % 2)]}"
+        moved = f"segment {chamber // 2} to the {SIDES[1 - 2 * (chamber % 2)]}"
         by = " and ".join(bent[chamber])
         if len(bent[chamber]) > 1:
             contradictions.append(f"valves {by} both bend {moved}: a hose is in the wrong port")
