@@ -127,8 +127,8 @@ class FitReport:
         late, deviation = self.delay
         if late < -3.0 * deviation:
             lines.append(
-                f"what was seen is {-1e3 * late:.0f} ± {1e3 * deviation:.0f} ms early, as no camera "
-                "is: check the clocks of the log, and mass and lengths of the limb"
+                f"what was seen is {-1e3 * late:.0f} ± {1e3 * deviation:.0f} ms early, as no "
+                "camera is: check the clocks of the log, and mass and lengths of the limb"
             )
         if late > 3.0 * deviation:
             lines.append(
