@@ -202,7 +202,7 @@ def test_what_is_seen_late_is_told_and_taken_out_of_the_fit(fitted):
         Limb.default(), replace(log, bend_angles=np.stack(seen, axis=1)), terms=["dynamics"]
     )
     assert told.delay[0] == pytest.approx(0.03, abs=0.004)
-    assert abs(told.delay[0] - told.taken_out) < 0.002
+    assert abs(told.delay[0] - told.taken_out) < max(4.0 * told.delay[1], 0.002)
     assert abs(told.value("log_damping").value) < 0.5
 
 
