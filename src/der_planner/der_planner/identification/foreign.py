@@ -16,9 +16,6 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from der_planner.arrays import Array
-from der_planner.bags.reader import BagError, BagReader
-from der_planner.bags.record import Columns, header_stamp
-from der_planner.bags.series import stream
 from der_planner.identification.log import LogError, on_grid
 from der_planner.model import CONTROL_PERIOD
 
@@ -184,6 +181,11 @@ def read_bag_table(path: Path) -> dict[str, Array]:
     Raises:
         LogError: the bag cannot be read, or holds none of these.
     """
+    # Only who reads bags needs the packages that do.
+    from der_planner.bags.reader import BagError, BagReader  # noqa: PLC0415
+    from der_planner.bags.record import Columns, header_stamp  # noqa: PLC0415
+    from der_planner.bags.series import stream  # noqa: PLC0415
+
     found: defaultdict[str, Columns] = defaultdict(Columns)
     try:
         with BagReader(path) as bag:
