@@ -24,7 +24,10 @@ def slow_log() -> CalibrationLog:
 DOORS = {
     "time in ms": (lambda log: {"time": 1e3 * log.time}, "a row every 50 s: give the time in sec"),
     "time in minutes": (lambda log: {"time": log.time / 3600.0}, "lasts 0.00832 s"),
-    "degrees": (lambda log: {"bend_angles": np.degrees(log.bend_angles)}, r"give them in rad, or .* \(angle_unit\)"),
+    "degrees": (
+        lambda log: {"bend_angles": np.degrees(log.bend_angles)},
+        r"give them in rad, or .* \(angle_unit\)",
+    ),
     "hPa": (
         lambda log: {
             "measured_differential": 0.01 * log.measured_differential,

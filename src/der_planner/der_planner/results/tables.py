@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import TypeVar
 
-from der_planner.results.evaluation import RunResult
+from der_planner.results.evaluation import NEAREST, RunResult
 from der_planner.results.statistics import Comparison, Summary
 
 CASE = {
@@ -158,7 +158,17 @@ def format_table(rows: Sequence[Summary], comparisons: Sequence[Comparison] = ()
     lines = [error_table(rows).text()]
     lines += [format_comparison(comparison) for comparison in comparisons]
     lines += [f"note: {_named(row)} {row.model}: {text}" for row in rows for text in row.problems]
-    return "\n".join(lines)
+    return "\n".join([*lines, *nearest_note(rows)])
+
+
+def nearest_note(rows: Sequence[Summary]) -> list[str]:
+    """Return a sentence on what errors count from, where a path was drawn that is out of reach."""
+    if not any(row.motion.endswith(NEAREST) for row in rows):
+        return []
+    return [
+        f"{NEAREST}: the reference, from which errors count, is the nearest path that the limb can "
+        "follow, not the drawn one (dotted in grey in the figure of the tip)"
+    ]
 
 
 def format_comparison(comparison: Comparison) -> str:
