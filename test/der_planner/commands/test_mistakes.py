@@ -62,6 +62,12 @@ def call(monkeypatch, capsys, tmp_path):
             1,
             "are longer than",
         ),
+        (
+            "der_planner.commands.run_experiment",
+            ["--dry-run", "--no-calibration", "--amplitude", "1.7"],
+            1,
+            "is out of reach",
+        ),
         ("der_planner.commands.study", ["accuracy", "--out", "BUSY"], 2, "no folder"),
         ("benchmarks.command", ["rod", "--json", "BUSY"], 2, "no folder"),
     ],
@@ -81,7 +87,10 @@ def test_a_dry_run_plans_the_path_and_names_a_twin_that_the_limb_file_is_not_of(
     found, said = call("der_planner.commands.run_experiment", *given)
     assert (found, "nearest=True; --nearest" in said) == (1, True)
     found, said = call("der_planner.commands.run_experiment", *given, "--nearest")
-    assert (found, "on the twin of seed 3, trials play on the twin of seed 1" in said) == (0, True)
+    assert (found, "of the twin of seed 3, trials play on twins from seed 1 on" in said) == (
+        0,
+        True,
+    )
     found, said = call("der_planner.commands.run_experiment", *given, "--nearest", "--seed", "3")
     assert (found, "warning" in said) == (0, False)
 

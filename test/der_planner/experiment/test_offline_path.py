@@ -50,7 +50,7 @@ def test_results_of_a_nearest_path_say_so(tmp_path: Path, capsys: pytest.Capture
     assert result["extra"]["drawn_path_m"] == [[0.22, 0.08], [0.24, 0.1]]
     page = (tmp_path / "out" / "report" / "report.html").read_text()
     for text in (page, capsys.readouterr().out):
-        assert "the nearest path that the limb can follow, not the drawn one" in text
+        assert "the reference is the nearest path in reach, not the drawn one" in text
 
 
 @pytest.mark.slow

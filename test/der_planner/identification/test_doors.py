@@ -26,7 +26,7 @@ DOORS = {
     "time in minutes": (lambda log: {"time": log.time / 3600.0}, "lasts 0.00832 s"),
     "degrees": (
         lambda log: {"bend_angles": np.degrees(log.bend_angles)},
-        r"give them in rad, or .* \(angle_unit\)",
+        "give them in rad, or name angle_unit in columns.yaml",
     ),
     "hPa": (
         lambda log: {
@@ -37,7 +37,7 @@ DOORS = {
     ),
     "thousandths of Pa": (
         lambda log: {"measured_differential": 1e3 * log.measured_differential},
-        r"give them in Pa, or .* \(pressure_unit\)",
+        "give them in Pa, or name pressure_unit in columns.yaml",
     ),
 }
 

@@ -307,8 +307,8 @@ def _obtain(prior: Limb, given: argparse.Namespace) -> CalibrationLog:
     """Play or read the log to fit to."""
     if given.graph:
         log = read_bag(_play_on_graph(prior, given))
-        twin = "" if given.hardware else f"twin, seed {given.seed}, "
-        return dataclasses.replace(log, source=twin + log.source)
+        source = log.source if given.hardware else f"twin, seed {given.seed}, bag"
+        return dataclasses.replace(log, source=source)
     if not given.offline:
         return read_log(given.log or given.bag or given.csv, _columns(given), given.namespace)
     limit = prior.pneumatics.pressure_limit

@@ -17,6 +17,8 @@ import contextlib
 import hashlib
 import json
 import os
+import platform
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -31,18 +33,11 @@ from der_planner.experiment.console import (
     interrupt_once,
     run_command,
 )
-from der_planner.experiment.description import (
-    check_motions,
-    describe,
-    metadata,
-    other_twin,
-    stage,
-)
 from der_planner.experiment.offline_run import load_arrays, play_offline
 from der_planner.experiment.options import Options, Trial, TrialRun, parse
 from der_planner.experiment.processes import GraphError, NodeError
 from der_planner.identification import LogError, calibrate_twin
-from der_planner.limb import Limb, LimbError
+from der_planner.limb import Limb, LimbError, mounting_of
 from der_planner.methods import LEARNED
 from der_planner.planning import PlanningError
 from der_planner.planning.correction import carried_over, nearest
@@ -65,6 +60,7 @@ from der_planner.results import (
     write_report,
     write_results,
 )
+from der_planner.results.evaluation import DRAWN
 from der_planner.results.report import instrument_table
 
 Kept = list[tuple[Trial, dict[str, Any]]]
@@ -105,8 +101,7 @@ def run(options: Options, progress: Progress | None = None) -> None:
     """Play what the options say and leave results.json, figures, bags and logs in the folder.
 
     Raises:
-        OptionError: the limb file is not usable, or the folder holds another experiment.
-        OptionError: the folder cannot be written.
+        OptionError: the limb file is not usable; the folder is not, or is of another experiment.
         PlanningError, LearningError: a motion cannot be planned, or cannot be learned.
         GraphError, NodeError: a trial failed; finished trials stay finished.
     """
@@ -119,15 +114,15 @@ def run(options: Options, progress: Progress | None = None) -> None:
     ledger = Ledger(options)
     left = [trial for trial in trials if len(ledger.runs_of(trial)) <= options.learn]
     check_folder(options.out)
-    check_motions(options, left, limb)
-    if said := other_twin(options, limb, trials):
+    options.check_motions(limb, left)
+    for said in filter(None, [limb.other_mounting, options.other_twin(limb)]):
         progress.say(f"warning: {said}")
     if options.dry_run:
-        describe(options, trials, left, limb, progress)
+        _describe(options, trials, left, limb, progress)
         return
     options.out.mkdir(parents=True, exist_ok=True)
     progress.say(
-        f"{len(left)} of {len(trials)} trials to play on {stage(options)}, into {options.out}"
+        f"{len(left)} of {len(trials)} trials to play on {_stage(options)}, into {options.out}"
     )
     for place, trial in enumerate(trials, start=1):
         if trial in left:
@@ -271,7 +266,7 @@ def _begin_from(library: Path, run: TrialRun, progress: Progress) -> Path | None
 
 def _play(run: TrialRun, progress: Progress) -> dict[str, Any]:
     """Play one run on the graph or in this process; return what the ledger keeps of it."""
-    about, library = metadata(run), run.options.library
+    about, library = _metadata(run), run.options.library
     if run.learned is None and library is not None:
         run = run._replace(learned=_begin_from(library, run, progress))
         if run.learned is not None:
@@ -308,6 +303,62 @@ def _limb_file(trial: Trial, options: Options, progress: Progress) -> Path | Non
 
 def _read(limb: Path | None) -> Limb:
     return Limb.from_yaml(limb) if limb is not None else Limb.default()
+
+
+def _stage(options: Options) -> str:
+    if options.hardware is not None and options.hardware.twin is None:
+        return f"the hardware at {options.hardware.place}"
+    return "the twin, offline" if options.offline else f"the twin, board {options.board}"
+
+
+def _describe(
+    options: Options, trials: list[Trial], left: list[Trial], limb: Limb, progress: Progress
+) -> None:
+    """Say what would be done."""
+    progress.say(f"limb: {limb.name}, {limb.segment_count} segments, {limb.length:.3f} m")
+    progress.say(f"loads: {_loads(limb)}")
+    progress.say(f"stage: {_stage(options)}")
+    if options.hardware is not None:
+        for name, values in vars(options.hardware).items():
+            progress.say(f"  {name}: {values or 'as it is'}")
+    progress.say(f"into: {options.out}")
+    for trial in trials:
+        state = "to play" if trial in left else "done"
+        progress.say(f"  {trial.name}  seed {trial.seed}  {state}")
+    each = f"of {options.period * options.cycles:.0f} s motion each"
+    where = each if options.path is None else f"along {options.path}"
+    progress.say(f"{len(left)} trials {where}; nothing was started")
+
+
+def _loads(limb: Limb) -> str:
+    masses = [f"{m.name} {m.mass * 1000:.4g} g at {m.arc_length:.3f} m" for m in limb.masses]
+    return ", ".join([mounting_of(limb.gravity), *masses])
+
+
+def _metadata(run: TrialRun) -> dict[str, Any]:
+    trial, options = run.trial, run.options
+    path = options.motion(trial.motion).path if options.nearest else None
+    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
+    commit = subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
+    return {
+        "motion": trial.motion,
+        "model": trial.model,
+        "method": trial.manner,
+        "trial": trial.number,
+        **({"learned_from": trial.run - 1} if trial.run > 1 else {}),
+        "seed": trial.seed,
+        "amplitude_rad": options.amplitude,
+        "period_s": options.period,
+        "cycles": options.cycles,
+        **({"path": str(options.path)} if options.path is not None else {}),
+        **({DRAWN: path.tip[:: 1 + len(path.tip) // 500].round(5).tolist()} if path else {}),
+        "limb": str(run.limb_file or "default"),
+        "loads": _loads(run.limb),
+        "stage": _stage(options),
+        "commit": commit or "unknown",
+        "python": platform.python_version(),
+        "machine": platform.node(),
+    }
 
 
 # The end -----------------------------------------------------------------------------------------

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import os
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable
@@ -146,14 +145,9 @@ class GraphClient:
                 limit = failing if bad else patience
                 if time.monotonic() - begin > limit:
                     said = status.message if status is not None else "nothing"
-                    load, cores = os.getloadavg()[0], os.cpu_count() or 1
-                    busy = (
-                        f". The machine is busy ({load:.1f} processes on {cores} cores): end what "
-                        "else runs on it, and start again"
-                    )
                     raise GraphError(
-                        f"node '{name}' was not ready within {limit:.0f} s; it says: {said}"
-                        f"{busy if load > cores else ''}"
+                        f"node '{name}' was not ready within {limit:.0f} s; it says: "
+                        f"{said}. On a busy machine, end what else runs, and start again"
                     )
             return not unready
 

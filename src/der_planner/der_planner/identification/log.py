@@ -326,8 +326,7 @@ def _check_excitation(pressure: Array) -> None:
             raise LogError(
                 f"input {index} was not excited (standard deviation {value:.0f} Pa, "
                 f"{LEAST_EXCITATION:.0f} Pa needed): nothing can be told of segment {index}; "
-                "run the calibration motion, or name the unit of the pressures in columns.yaml "
-                "(pressure_unit)"
+                "run the calibration motion, or name their unit in columns.yaml (pressure_unit)"
             )
 
 

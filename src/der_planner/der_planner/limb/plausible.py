@@ -13,10 +13,7 @@ FEW = 0.02
 """Share of rows up to which impossible numbers are outliers, and not another unit."""
 TOO_SMALL = 0.05
 """Share of what is expected below which pressures have another unit, or are not there."""
-_UNITS = {
-    "pressures": "Pa, or name their unit in columns.yaml (pressure_unit)",
-    "bend angles": "rad, or name their unit in columns.yaml (angle_unit)",
-}
+_UNITS = {"pressures": "Pa, or name pressure_unit", "bend angles": "rad, or name angle_unit"}
 
 
 def impossible(limb: Limb, what: str, values: ArrayLike) -> NDArray[np.bool_]:
@@ -46,8 +43,8 @@ def outliers(
     rows, size = impossible(limb, what, values), np.abs(np.asarray(values, dtype=float))
     if rows.sum() > FEW * np.isfinite(size).any(axis=-1).sum():
         raise error(
-            f"the {what} are about {np.nanmedian(size[rows]):.3g}: give them in {_UNITS[what]}; "
-            f"the limb '{limb.name}' is {limb.length:.3g} m long and takes "
+            f"the {what} are about {np.nanmedian(size[rows]):.3g}: give them in {_UNITS[what]} in "
+            f"columns.yaml; the limb '{limb.name}' is {limb.length:.3g} m long and takes "
             f"±{limb.pneumatics.pressure_limit:.0f} Pa"
         )
     return rows

@@ -58,8 +58,6 @@ DEFAULT_PERIOD = 20.0
 """Period of a cycle where none is given [s]."""
 DEFAULT_CYCLES = 2
 """Number of cycles where none is given."""
-_FARTHEST = 3.0
-"""A path beyond so many lengths of the limb is taken for one in other units."""
 _SAG_ROUNDS = 3
 """Corrections of a path for the limb's sag, each of which leaves some per cent of the last."""
 
@@ -222,8 +220,8 @@ class Motion:
 
         Raises:
             UnreachableError: a point of a tip path is out of reach.
-            PlanningError: it is so far away that its unit must be another one.
             BucklingError: the vented limb does not stay where it rests.
+            PlanningError: the path cannot be followed, or must be in another unit.
         """
         deviation, rest, fastest = None, workspace.rest, workspace.fastest
         if self.name in JOINT_MOTIONS and self.path is None:
@@ -276,12 +274,7 @@ class Motion:
                 self.cycles,
                 rest.bend_by_load,
             )
-        farthest, length = float(np.abs(path.tip).max()), workspace.limb.length
-        if farthest > _FARTHEST * length:
-            raise PlanningError(
-                f"points are in metres: {farthest:.4g} is {farthest / length:.0f} lengths of the "
-                "limb; millimetres are divided by 1000 (a file names them: x [mm])"
-            )
+        path.check_unit(workspace.limb.length)
         if self.nearest:
             return self._nearest_motion(workspace, path)
         time, tip = path.resample(FINE_PERIOD * 2)

@@ -96,7 +96,7 @@ def plan(
     with _THREADS.limit(limits=1, user_api="blas"):
         rod = RodModel(limb, nodes)
         body = rod if model == "der" else Model.of(limb, model)
-        reference, configuration = _followed(motion, rod, body, start)
+        reference, configuration = followed(motion, rod, body, start)
         led = ""
         if obstacles is not None:
             rounds = _ROUNDS if model == "der" and method == "optimal" else 0
@@ -142,7 +142,7 @@ def plan(
     )
 
 
-def _followed(
+def followed(
     motion: Motion, rod: RodModel, body: Model, start: Start | None
 ) -> tuple[Reference, Configuration]:
     """Return a motion's reference, and the configuration of a model along it.
