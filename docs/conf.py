@@ -55,6 +55,7 @@ sphinx_gallery_conf = {
     "remove_config_comments": True,
     "abort_on_example_error": True,
     "plot_gallery": "True",
+    "capture_repr": (),  # what is printed alone: not what the last line of a cell returns
 }
 
 

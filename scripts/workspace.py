@@ -60,6 +60,7 @@ def ensure() -> None:
     """
     with _only_one_setup():
         if not venv_is_complete():
+            say("the first set-up usually takes 5 to 10 minutes in all")
             install_venv()
         run_jobs(*build_jobs(), *kernel_jobs())
 

@@ -147,9 +147,14 @@ for _ in range(3):
     played = play(learner.next(), Arm())
     errors.append(played.error.mean())
     learner.add(played.time, played.tip)
-corrected = play(made, Arm(), Feedback(made), Sensors())
+feedback = Feedback(made)
+corrected = play(made, Arm(), feedback, Sensors())
 print("mean error in mm: planned, learned once, twice", np.round(1e3 * np.array(errors), 2))
 print("with feedback", round(1e3 * corrected.error.mean(), 2))
+if feedback.warnings:
+    print("feedback was switched off, since", feedback.warnings[0].message)
+else:
+    print(f"feedback stayed on: it sent {100 * feedback.share:.0f} % of its corrections at the end")
 assert errors[0] < 0.01
 assert min(errors[1:]) < errors[0]
 

@@ -24,6 +24,7 @@ NAME = "der_planner"
 USE = """
 import importlib.util, sys
 import numpy as np
+from der_planner.control import Feedback, Learner
 from der_planner.limb import Limb
 from der_planner.planning import Motion, plan
 from der_planner.rod import Rod
@@ -40,7 +41,8 @@ for model, method in (("der", "optimal"), ("pcc", "paper")):
     error = np.linalg.norm(made.tip_predicted - made.tip_reference, axis=1)
     assert made.differential_pressure.shape == (len(made.time), 2)
     assert error.mean() < 5e-3, (model, error.mean())
-for name in ("rclpy", "elastica", "rosbags", "matplotlib", "cv2", "nicegui", "pressure_driver"):
+away = "rclpy elastica mcap rosbags matplotlib cv2 nicegui pressure_driver"
+for name in away.split():
     assert importlib.util.find_spec(name) is None, name
 print("planned from", sys.modules["der_planner"].__file__)
 """

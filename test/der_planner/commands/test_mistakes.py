@@ -3,11 +3,13 @@
 import importlib
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from der_planner.experiment.processes import find_executable
+from der_planner.limb import Limb
 
 SCRIPTS = Path(__file__).resolve().parents[3] / "scripts"
 
@@ -54,6 +56,18 @@ def call(monkeypatch, capsys, tmp_path):
         ("apriltag_tracker.commands.calibrate_camera", [*LENS, "--bag", __file__], 1, "the bag"),
         ("der_planner.commands.run_experiment", ["--dry-run", "--out", "BUSY"], 2, "cannot be"),
         ("der_planner.commands.run_experiment", ["--limb", __file__], 2, "is not valid YAML"),
+        (
+            "der_planner.commands.run_experiment",
+            ["--dry-run", "--period", "600", "--cycles", "1000"],
+            1,
+            "are longer than",
+        ),
+        (
+            "der_planner.commands.run_experiment",
+            ["--dry-run", "--no-calibration", "--amplitude", "1.7"],
+            1,
+            "is out of reach",
+        ),
         ("der_planner.commands.study", ["accuracy", "--out", "BUSY"], 2, "no folder"),
         ("benchmarks.command", ["rod", "--json", "BUSY"], 2, "no folder"),
     ],
@@ -63,6 +77,22 @@ def test_mistakes_are_said_before_any_work_is_done(call, module, arguments, code
     assert found == code
     assert "error: " in said
     assert words in said
+
+
+def test_a_dry_run_plans_the_path_and_names_a_twin_that_the_limb_file_is_not_of(call, tmp_path):
+    path, limb = tmp_path / "path.csv", tmp_path / "limb.yaml"
+    path.write_text("x [cm], y [cm]\n20, 10\n26, 10\n")
+    replace(Limb.default(), provenance={"source": "twin, seed 3, run 1"}).to_yaml(limb)
+    given = ("--dry-run", "--limb", str(limb), "--path", str(path))
+    found, said = call("der_planner.commands.run_experiment", *given)
+    assert (found, "nearest=True; --nearest" in said) == (1, True)
+    found, said = call("der_planner.commands.run_experiment", *given, "--nearest")
+    assert (found, "of the twin of seed 3, trials play on twins from seed 1 on" in said) == (
+        0,
+        True,
+    )
+    found, said = call("der_planner.commands.run_experiment", *given, "--nearest", "--seed", "3")
+    assert (found, "warning" in said) == (0, False)
 
 
 def test_pressures_beyond_the_limit_start_nothing(call, tmp_path):

@@ -40,6 +40,20 @@ def test_a_path_is_drawn_and_reported(tmp_path: Path):
 
 
 @pytest.mark.slow
+def test_results_of_a_nearest_path_say_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    file = tmp_path / "line.csv"
+    file.write_text("x [cm], y [cm]\n22, 8\n24, 10\n")
+    arguments = ["--offline", "--no-calibration", "--models", "pcc", "--path", str(file)]
+    run(parse([*arguments, "--nearest", "--out", str(tmp_path / "out")]))
+    (result,) = json.loads((tmp_path / "out" / "results.json").read_text())["runs"]
+    assert result["motion"] == "line, nearest path"
+    assert result["extra"]["drawn_path_m"] == [[0.22, 0.08], [0.24, 0.1]]
+    page = (tmp_path / "out" / "report" / "report.html").read_text()
+    for text in (page, capsys.readouterr().out):
+        assert "the reference is the nearest path in reach, not the drawn one" in text
+
+
+@pytest.mark.slow
 def test_feedback_stands_beside_the_open_loop(tmp_path: Path):
     arguments = ["--offline", "--no-calibration", "--models", "der", "--feedback", "--seed", "3"]
     arguments += ["--period", "12", "--cycles", "1"]

@@ -24,17 +24,20 @@ def slow_log() -> CalibrationLog:
 DOORS = {
     "time in ms": (lambda log: {"time": 1e3 * log.time}, "a row every 50 s: give the time in sec"),
     "time in minutes": (lambda log: {"time": log.time / 3600.0}, "lasts 0.00832 s"),
-    "degrees": (lambda log: {"bend_angles": np.degrees(log.bend_angles)}, "give them in rad"),
+    "degrees": (
+        lambda log: {"bend_angles": np.degrees(log.bend_angles)},
+        "give them in rad, or name angle_unit in columns.yaml",
+    ),
     "hPa": (
         lambda log: {
             "measured_differential": 0.01 * log.measured_differential,
             "commanded_differential": 0.01 * log.commanded_differential,
         },
-        "check the units of the log",
+        r"name their unit in columns.yaml \(pressure_unit\)",
     ),
     "thousandths of Pa": (
         lambda log: {"measured_differential": 1e3 * log.measured_differential},
-        "give them in Pa",
+        "give them in Pa, or name pressure_unit in columns.yaml",
     ),
 }
 

@@ -132,6 +132,15 @@ def test_an_unreachable_path_names_time_point_and_distance():
     assert 0.0 < error.distance < 0.01
     assert math.isnan(error.required_pressure)
     assert "out of reach" in str(error)
+    assert "nearest=True; --nearest" in str(error)
+
+
+@pytest.mark.parametrize("nearest", [False, True])
+def test_a_path_in_millimetres_is_refused_by_its_unit(nearest):
+    motion = Motion.from_tip_path(None, [(120.0, 80.0), (110.0, 90.0)], nearest=nearest)
+    said = r"in metres: 120 is 492 lengths of the limb; millimetres are divided by 1000"
+    with pytest.raises(PlanningError, match=said):
+        motion.reference(SPACE)
 
 
 def test_a_pose_beyond_the_pressure_limit_says_what_it_would_need():

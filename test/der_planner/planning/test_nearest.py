@@ -30,7 +30,6 @@ FOREIGN = {
     "behind the clamp": (None, [(-0.1, 0.0), (-0.1, 0.05)]),
     "ten thousand points": (None, TREMBLING),
     "ten thousand points in time": (np.linspace(0, 20, 10_000), TREMBLING),
-    "in centimetres": (None, 100 * (CENTRE + 0.03 * RING)),
 }
 
 

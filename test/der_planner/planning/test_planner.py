@@ -254,6 +254,11 @@ def test_unknown_models_and_methods_are_named(model_name, method, message):
         plan(LIMB, Motion.named("asynchronous"), model_name, method)
 
 
+def test_what_is_no_motion_is_told_how_to_make_one():
+    with pytest.raises(PlanningError, match=r"got str: Motion\.named\(name\) with .*, star; or"):
+        plan(LIMB, "star")
+
+
 @pytest.mark.parametrize("which", EVERY)
 def test_too_large_an_amplitude_is_refused_by_all(which):
     with pytest.raises(UnreachableError, match="out of reach"):

@@ -306,7 +306,9 @@ def _excitation(prior: Limb, pressure_limit: float, given: argparse.Namespace) -
 def _obtain(prior: Limb, given: argparse.Namespace) -> CalibrationLog:
     """Play or read the log to fit to."""
     if given.graph:
-        return read_bag(_play_on_graph(prior, given))
+        log = read_bag(_play_on_graph(prior, given))
+        source = log.source if given.hardware else f"twin, seed {given.seed}, bag"
+        return dataclasses.replace(log, source=source)
     if not given.offline:
         return read_log(given.log or given.bag or given.csv, _columns(given), given.namespace)
     limit = prior.pneumatics.pressure_limit

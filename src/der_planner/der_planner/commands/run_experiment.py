@@ -60,6 +60,7 @@ from der_planner.results import (
     write_report,
     write_results,
 )
+from der_planner.results.evaluation import DRAWN
 from der_planner.results.report import instrument_table
 
 Kept = list[tuple[Trial, dict[str, Any]]]
@@ -100,8 +101,7 @@ def run(options: Options, progress: Progress | None = None) -> None:
     """Play what the options say and leave results.json, figures, bags and logs in the folder.
 
     Raises:
-        OptionError: the limb file is not usable, or the folder holds another experiment.
-        OptionError: the folder cannot be written.
+        OptionError: the limb file is not usable; the folder is not, or is of another experiment.
         PlanningError, LearningError: a motion cannot be planned, or cannot be learned.
         GraphError, NodeError: a trial failed; finished trials stay finished.
     """
@@ -114,6 +114,9 @@ def run(options: Options, progress: Progress | None = None) -> None:
     ledger = Ledger(options)
     left = [trial for trial in trials if len(ledger.runs_of(trial)) <= options.learn]
     check_folder(options.out)
+    options.check_motions(limb, left)
+    for said in filter(None, [limb.other_mounting, options.other_twin(limb)]):
+        progress.say(f"warning: {said}")
     if options.dry_run:
         _describe(options, trials, left, limb, progress)
         return
@@ -314,8 +317,6 @@ def _describe(
     """Say what would be done."""
     progress.say(f"limb: {limb.name}, {limb.segment_count} segments, {limb.length:.3f} m")
     progress.say(f"loads: {_loads(limb)}")
-    if limb.other_mounting:
-        progress.say(f"warning: {limb.other_mounting}")
     progress.say(f"stage: {_stage(options)}")
     if options.hardware is not None:
         for name, values in vars(options.hardware).items():
@@ -336,6 +337,7 @@ def _loads(limb: Limb) -> str:
 
 def _metadata(run: TrialRun) -> dict[str, Any]:
     trial, options = run.trial, run.options
+    path = options.motion(trial.motion).path if options.nearest else None
     command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
     commit = subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
     return {
@@ -349,6 +351,7 @@ def _metadata(run: TrialRun) -> dict[str, Any]:
         "period_s": options.period,
         "cycles": options.cycles,
         **({"path": str(options.path)} if options.path is not None else {}),
+        **({DRAWN: path.tip[:: 1 + len(path.tip) // 500].round(5).tolist()} if path else {}),
         "limb": str(run.limb_file or "default"),
         "loads": _loads(run.limb),
         "stage": _stage(options),

@@ -146,7 +146,8 @@ class GraphClient:
                 if time.monotonic() - begin > limit:
                     said = status.message if status is not None else "nothing"
                     raise GraphError(
-                        f"node '{name}' was not ready within {limit:.0f} s; it says: {said}"
+                        f"node '{name}' was not ready within {limit:.0f} s; it says: "
+                        f"{said}. On a busy machine, end what else runs, and start again"
                     )
             return not unready
 

@@ -17,6 +17,7 @@ from der_planner.experiment.console import Loads, OptionError, add_load_options
 from der_planner.experiment.processes import Hardware
 from der_planner.limb import Limb
 from der_planner.methods import LEARNED
+from der_planner.model import Model, RodModel
 from der_planner.planning import METHODS as METHODS_BY_MODEL
 from der_planner.planning import Motion, Obstacles, Plan, PlanningError, plan
 from der_planner.planning.motions import (
@@ -26,6 +27,7 @@ from der_planner.planning.motions import (
     JOINT_MOTIONS,
 )
 from der_planner.planning.motions import NAMES as MOTIONS
+from der_planner.planning.planner import followed
 from pressure_driver.protocols import NAMES as BOARDS
 
 MODELS = tuple(METHODS_BY_MODEL)
@@ -190,6 +192,30 @@ class Options:
             PlanningError: the file cannot be used.
         """
         return Obstacles.from_yaml(self.obstacles) if self.obstacles else None
+
+    def check_motions(self, limb: Limb, trials: Sequence[Trial]) -> None:
+        """Refuse what the limb cannot do before anything is started.
+
+        Raises:
+            PlanningError: numbers of a motion, or a path that is out of reach.
+        """
+        rod = RodModel(limb)
+        for name, model in {(trial.motion, trial.model) for trial in trials}:
+            motion = self.motion(name)
+            if not self.calibrate:
+                followed(motion, rod, Model.of(limb, model), None)
+            elif motion.path is not None:  # what a limb reaches is known once it is calibrated
+                motion.path.check_unit(limb.length)
+
+    def other_twin(self, limb: Limb) -> str:
+        """Return a sentence where the limb file is of another twin than a trial's; else empty."""
+        own = re.match(r"twin, seed (\d+)", str(limb.provenance.get("source", "")))
+        if own is None or self.hardware or (int(own[1]), 1) == (self.seed, self.trials):
+            return ""
+        return (
+            f"{self.limb} is of the twin of seed {own[1]}, trials play on twins from seed "
+            f"{self.seed} on: give --seed {own[1]} --trials 1, or leave --limb out"
+        )
 
     def plan_of_trials(self) -> list[Trial]:
         """Return every trial in the order in which they are played."""

@@ -16,9 +16,6 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from der_planner.arrays import Array
-from der_planner.bags.reader import BagError, BagReader
-from der_planner.bags.record import Columns, header_stamp
-from der_planner.bags.series import stream
 from der_planner.identification.log import LogError, on_grid
 from der_planner.model import CONTROL_PERIOD
 
@@ -184,20 +181,22 @@ def read_bag_table(path: Path) -> dict[str, Array]:
     Raises:
         LogError: the bag cannot be read, or holds none of these.
     """
-    found: defaultdict[str, Columns] = defaultdict(Columns)
+    from der_planner.bags import reader, record, series  # noqa: PLC0415 - few need bags
+
+    found: defaultdict[str, record.Columns] = defaultdict(record.Columns)
     try:
-        with BagReader(path) as bag:
+        with reader.BagReader(path) as bag:
             for topic, logged, message in bag.messages(list(bag.topics)):
-                stamp = header_stamp(message) if hasattr(message, "header") else 0
+                stamp = record.header_stamp(message) if hasattr(message, "header") else 0
                 for name, value in _values(topic, message).items():
                     found[name].append(stamp or logged, (value,))
-    except BagError as error:
+    except reader.BagError as error:
         raise LogError(str(error)) from error
     known = {name: rows for name, rows in found.items() if len(rows) > 1}
     if not known:
         raise LogError(f"the bag {path} holds no joint states, arrays or fluid pressures")
     origin = max(int(rows.stamps().min()) for rows in known.values())
-    streams = {name: stream(rows, 1, origin) for name, rows in known.items()}
+    streams = {name: series.stream(rows, 1, origin) for name, rows in known.items()}
     end = min(each.time[-1] for each in streams.values())
     if end < 1.0:
         raise LogError(f"the topics of {path} do not overlap: do their clocks agree?")

@@ -237,9 +237,9 @@ def lengths_at_their_end(prior: Limb, found: Limb) -> str:
     if not ends:
         return ""
     return (
-        f"lengths as far from the prior's as they may be: {', '.join(ends)}. Measure the segments "
-        "and give their lengths in the limb file of --prior; check the unit and the origin of the "
-        "tips"
+        "the limb may be unlike the model: tips do not go with even bends. Or lengths are as far "
+        f"from the prior's as they may be: {', '.join(ends)}. Measure the segments and give their "
+        "lengths in the limb file of --prior; check the unit and the origin of the tips"
     )
 
 

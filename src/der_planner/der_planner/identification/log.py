@@ -259,7 +259,7 @@ def _check_time(log: CalibrationLog) -> None:
     if period > LONGEST_PERIOD or duration < LEAST_DURATION:
         raise LogError(
             f"the log lasts {duration:.3g} s, with a row every {period:.3g} s: give the time in "
-            "seconds, or name its unit (time_unit)"
+            "seconds, or name its unit in columns.yaml (time_unit)"
         )
 
 
@@ -315,8 +315,8 @@ def _check_scale(pressure: Array, bend: Array, limb: Limb) -> None:
     if moved > LEAST_MOTION and driven < TOO_SMALL * moved:
         raise LogError(
             f"segments bend by {np.degrees(moved):.0f}° while their pressures change by "
-            f"{np.ptp(pressure, axis=0).max():.3g} Pa: check the units of the log, and that "
-            "nobody moves the limb"
+            f"{np.ptp(pressure, axis=0).max():.3g} Pa: name their unit in columns.yaml "
+            "(pressure_unit), and check that nobody moves the limb"
         )
 
 
@@ -326,7 +326,7 @@ def _check_excitation(pressure: Array) -> None:
             raise LogError(
                 f"input {index} was not excited (standard deviation {value:.0f} Pa, "
                 f"{LEAST_EXCITATION:.0f} Pa needed): nothing can be told of segment {index}; "
-                "run the calibration motion, or check the unit of the pressures"
+                "run the calibration motion, or name their unit in columns.yaml (pressure_unit)"
             )
 
 

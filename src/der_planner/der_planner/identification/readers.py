@@ -14,9 +14,6 @@ import yaml
 from numpy.typing import NDArray
 
 from der_planner.arrays import Array
-from der_planner.bags.reader import BagError, BagReader
-from der_planner.bags.record import PRESSURE_TYPE, STATE_TYPE, LimbRecord, read_record
-from der_planner.bags.series import stream
 from der_planner.identification.foreign import (
     LONGEST_SILENCE,
     bends_of,
@@ -58,20 +55,22 @@ def read_bag(path: str | Path, namespace: str = "") -> CalibrationLog:
         LogError: the bag cannot be read, holds several limbs and none is named, or lacks pressures
             or limb states; the message says which.
     """
+    from der_planner.bags import reader, record, series  # noqa: PLC0415 - few need bags
+
     try:
-        record = read_record(path)
-        measured_limbs = [name for name, limb in record.limbs.items() if len(limb.measured)]
-        chosen = record.limb_named(namespace, measured_limbs)
-    except BagError as error:
+        bag = record.read_record(path)
+        measured_limbs = [name for name, limb in bag.limbs.items() if len(limb.measured)]
+        chosen = bag.limb_named(namespace, measured_limbs)
+    except reader.BagError as error:
         raise LogError(str(error)) from error
-    limb = record.limbs.get(chosen, LimbRecord())
+    limb, stream = bag.limbs.get(chosen, record.LimbRecord()), series.stream
     if len(limb.measured) < LEAST_MESSAGES:
         raise LogError(
-            f"the bag {path} holds no pressures ({PRESSURE_TYPE}): was the driver running?"
+            f"the bag {path} holds no pressures ({record.PRESSURE_TYPE}): was the driver running?"
         )
     if np.isfinite(limb.tip.values(2)).all(axis=1).sum() < LEAST_MESSAGES:
         raise LogError(
-            f"the bag {path} holds no valid limb state ({STATE_TYPE}): was the limb seen?"
+            f"the bag {path} holds no valid limb state ({record.STATE_TYPE}): was the limb seen?"
         )
     count, origin = limb.angles.width, int(limb.measured.stamps().min())
     measured, angles = stream(limb.measured, count, origin), stream(limb.angles, count, origin)
@@ -280,10 +279,12 @@ def read_log(path: Path, columns: Path | None, namespace: str = "") -> Calibrati
 
 def is_ours(path: Path) -> bool:
     """Tell whether a bag is of our driver; one that cannot be read says why when it is read."""
+    from der_planner.bags import reader, record  # noqa: PLC0415
+
     try:
-        with BagReader(path) as bag:
-            return any(topic.type_name == PRESSURE_TYPE for topic in bag.topics.values())
-    except BagError:
+        with reader.BagReader(path) as bag:
+            return any(topic.type_name == record.PRESSURE_TYPE for topic in bag.topics.values())
+    except reader.BagError:
         return True
 
 

@@ -13,7 +13,7 @@ FEW = 0.02
 """Share of rows up to which impossible numbers are outliers, and not another unit."""
 TOO_SMALL = 0.05
 """Share of what is expected below which pressures have another unit, or are not there."""
-_UNITS = {"pressures": "Pa", "bend angles": "rad", "tips": "m from the clamp"}
+_UNITS = {"pressures": "Pa, or name pressure_unit", "bend angles": "rad, or name angle_unit"}
 
 
 def impossible(limb: Limb, what: str, values: ArrayLike) -> NDArray[np.bool_]:
@@ -35,7 +35,7 @@ def impossible(limb: Limb, what: str, values: ArrayLike) -> NDArray[np.bool_]:
 def outliers(
     limb: Limb, what: str, values: ArrayLike, error: type[ValueError]
 ) -> NDArray[np.bool_]:
-    """Return the few rows (K,) of values (K, N) that are impossible, as `impossible` has it.
+    """Return the few rows (K,) of a log's values (K, N) that are impossible, see `impossible`.
 
     Raises:
         ValueError: as ``error``: they are not few.
@@ -43,8 +43,8 @@ def outliers(
     rows, size = impossible(limb, what, values), np.abs(np.asarray(values, dtype=float))
     if rows.sum() > FEW * np.isfinite(size).any(axis=-1).sum():
         raise error(
-            f"the {what} are about {np.nanmedian(size[rows]):.3g}: give them in {_UNITS[what]}, of "
-            f"the limb '{limb.name}' of {limb.length:.3g} m and "
+            f"the {what} are about {np.nanmedian(size[rows]):.3g}: give them in {_UNITS[what]} in "
+            f"columns.yaml; the limb '{limb.name}' is {limb.length:.3g} m long and takes "
             f"±{limb.pneumatics.pressure_limit:.0f} Pa"
         )
     return rows

@@ -221,7 +221,7 @@ class Motion:
         Raises:
             UnreachableError: a point of a tip path is out of reach.
             BucklingError: the vented limb does not stay where it rests.
-            PlanningError: the path cannot be followed.
+            PlanningError: the path cannot be followed, or must be in another unit.
         """
         deviation, rest, fastest = None, workspace.rest, workspace.fastest
         if self.name in JOINT_MOTIONS and self.path is None:
@@ -274,6 +274,7 @@ class Motion:
                 self.cycles,
                 rest.bend_by_load,
             )
+        path.check_unit(workspace.limb.length)
         if self.nearest:
             return self._nearest_motion(workspace, path)
         time, tip = path.resample(FINE_PERIOD * 2)

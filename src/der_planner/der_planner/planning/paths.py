@@ -76,6 +76,15 @@ class TipPath:
         """From the first to the last point [s]."""
         return float(self.time[-1])
 
+    def check_unit(self, length: float) -> None:
+        """Refuse a path that is as far away from a limb of a length [m] as other units make it."""
+        farthest = float(np.abs(self.tip).max())
+        if farthest > 3.0 * length:
+            raise PlanningError(
+                f"points are in metres: {farthest:.4g} is {farthest / length:.0f} lengths of the "
+                "limb; millimetres are divided by 1000 (a file names them: x [mm])"
+            )
+
     def resample(self, step: float) -> tuple[Array, Array]:
         """Return instants about ``step`` apart and the points (K, 2) there."""
         instants = np.linspace(0.0, self.duration, max(8, round(self.duration / step) + 1))

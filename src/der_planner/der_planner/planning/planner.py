@@ -21,7 +21,7 @@ from der_planner.planning.loads import (
     PlanningError,
     nearly_buckling,
 )
-from der_planner.planning.motions import Motion, Reference
+from der_planner.planning.motions import NAMES, Motion, Reference
 from der_planner.planning.obstacles import Obstacles
 from der_planner.planning.optimal import Optimiser, Optimum
 from der_planner.planning.plan_file import Plan
@@ -78,20 +78,25 @@ def plan(
     are those of another mounting.
 
     Raises:
-        PlanningError: unknown model or method.
+        PlanningError: unknown model or method, or something else than a motion.
         UnreachableError: a point is out of reach or needs more pressure than allowed.
         OverloadError: holding the limb under its loads takes more pressure than allowed.
         ObstacleError: the limb would run into an obstacle.
         BucklingError: the limb does not stay where it rests, or on the way.
     """
     begin = clock.perf_counter()
+    if not isinstance(motion, Motion):
+        raise PlanningError(
+            f"a motion is expected, got {type(motion).__name__}: Motion.named(name) with "
+            f"{', '.join(NAMES)}; or Motion.from_tip_path(time, points)"
+        )
     method = choose_method(model, method)
     report = progress or (lambda _share: None)
     # Its matrices are small: more threads only get into other processes' way.
     with _THREADS.limit(limits=1, user_api="blas"):
         rod = RodModel(limb, nodes)
         body = rod if model == "der" else Model.of(limb, model)
-        reference, configuration = _followed(motion, rod, body, start)
+        reference, configuration = followed(motion, rod, body, start)
         led = ""
         if obstacles is not None:
             rounds = _ROUNDS if model == "der" and method == "optimal" else 0
@@ -137,7 +142,7 @@ def plan(
     )
 
 
-def _followed(
+def followed(
     motion: Motion, rod: RodModel, body: Model, start: Start | None
 ) -> tuple[Reference, Configuration]:
     """Return a motion's reference, and the configuration of a model along it.

@@ -257,8 +257,8 @@ def paced(place: Array, rate: Array, greatest: Array, rest: bool) -> tuple[Array
     time = np.concatenate([[0.0], np.cumsum(durations)])
     if time[-1] > LONGEST:
         raise PlanningError(
-            f"the path would last {time[-1]:.0f} s, the longest is {LONGEST:.0f} s: draw less, or "
-            "allow a higher speed"
+            f"the path would last {time[-1]:.0f} s, the longest is {LONGEST:.0f} s: draw less, "
+            "allow a higher speed, or give points in metres if they are not"
         )
     grid = np.linspace(0.0, time[-1], max(20, round(time[-1] / _GRID) + 1))
     step = float(grid[1])

@@ -68,7 +68,8 @@ class UnreachableError(PlanningError):
             f"the point ({self.point[0]:.4f}, {self.point[1]:.4f}) m at t = {self.time:.2f} s is "
             f"out of reach: {self.distance * 1000:.1f} mm from what the limb reaches within its "
             f"pressure limit; {needed}. {carries if self.carried else 'Move'} or shrink the path "
-            "(a named motion: by its amplitude, in rad)"
+            "(a named motion: by its amplitude, in rad), or follow the nearest path that the limb "
+            "can (nearest=True; --nearest)"
         )
 
 

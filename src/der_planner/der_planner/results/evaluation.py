@@ -37,6 +37,8 @@ GAP = 0.5
 """Longest time without a valid image [s] that leaves a run fit for comparison."""
 LEAST_VALID = 0.9
 """Least share of valid images of such a run."""
+DRAWN = "drawn_path_m"
+"""Key of the drawn points, of a run along the nearest path to them."""
 REFERENCE_POINTS = 25
 LARGEST_AHEAD = 1e-3
 """Stamps may be this far [s] from the future in such a run."""
@@ -132,7 +134,7 @@ def evaluate_run(run: RunSeries, settings: EvaluationSettings | None = None) -> 
     about = run.description
     valid = len(series.time) / max(1, len(images))
     return RunResult(
-        motion=about.motion,
+        motion=f"{about.motion}, nearest path" if DRAWN in about.extra else about.motion,
         model=about.model,
         method=about.method,
         trial=about.trial,

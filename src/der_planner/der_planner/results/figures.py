@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from der_planner.arrays import Array
 from der_planner.bags.run import RunSeries, Stream
 from der_planner.results.errors import error_series
-from der_planner.results.evaluation import RunResult
+from der_planner.results.evaluation import DRAWN, RunResult
 from der_planner.results.statistics import learning_curves
 from der_planner.results.tables import CASE
 
@@ -143,6 +143,8 @@ def _draw_tip_row(row: Sequence[Axes], title: str, runs: Sequence[RunSeries]) ->
         plane.plot(tip[:, 0], tip[:, 1], label=f"{model.upper()}, measured", **look)
         over_x.plot(time, tip[:, 0], **look)
         over_y.plot(time, tip[:, 1], **look)
+    if drawn := runs[0].description.extra.get(DRAWN):
+        plane.plot(*np.transpose(drawn) * CM, label="drawn", color="0.6", ls=":")
     reference = runs[0].reference
     black: dict[str, Any] = {"color": REFERENCE, "lw": 0.9, "ls": ":"}
     value = reference.value * CM

@@ -14,7 +14,7 @@ from string import Template
 from typing import Any
 
 from der_planner.bags.run import RunSeries
-from der_planner.results.evaluation import RunResult, json_value
+from der_planner.results.evaluation import DRAWN, RunResult, json_value
 from der_planner.results.figures import (
     plot_error,
     plot_learning,
@@ -30,6 +30,7 @@ from der_planner.results.tables import (
     csv_table,
     error_table,
     format_comparison,
+    nearest_note,
     number,
     numbers,
     several_limbs,
@@ -141,6 +142,7 @@ def section(title: str, table: Table) -> str:
 def _sections(results: Sequence[RunResult], figures: Sequence[str]) -> list[str]:
     return [
         error_table(summarise(results)).html(),
+        *(f"<p>{html.escape(said)}</p>" for said in nearest_note(summarise(results))),
         *(f"<p>{html.escape(format_comparison(entry))}</p>" for entry in compare(results)),
         section("Open loop, feedback, learning", side_by_side_table(results)),
         *figures,
@@ -241,7 +243,7 @@ def instrument_table(results: Sequence[RunResult]) -> Table:
 def _provenance(results: Sequence[RunResult]) -> Table:
     """List what the runs say of themselves: one line where all agree, else every value."""
     rows = []
-    for key in sorted({key for run in results for key in run.extra} - {"feedback"}):
+    for key in sorted({key for run in results for key in run.extra} - {"feedback", DRAWN}):
         values = dict.fromkeys(str(run.extra.get(key, "–")) for run in results)
         rows.append([key, ", ".join(values)])
     rows += [[f"bag of {run.model} {run.trial}", run.bag] for run in results if run.bag]

@@ -158,7 +158,13 @@ def format_table(rows: Sequence[Summary], comparisons: Sequence[Comparison] = ()
     lines = [error_table(rows).text()]
     lines += [format_comparison(comparison) for comparison in comparisons]
     lines += [f"note: {_named(row)} {row.model}: {text}" for row in rows for text in row.problems]
-    return "\n".join(lines)
+    return "\n".join([*lines, *nearest_note(rows)])
+
+
+def nearest_note(rows: Sequence[Summary]) -> list[str]:
+    """Return a sentence on what errors count from, where a path was drawn that is out of reach."""
+    said = "nearest path: the reference is the nearest path in reach, not the drawn one (grey dots)"
+    return [said] if any(row.motion.endswith(", nearest path") for row in rows) else []
 
 
 def format_comparison(comparison: Comparison) -> str:
