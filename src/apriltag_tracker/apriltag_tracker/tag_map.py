@@ -95,6 +95,11 @@ class TagMap:
         return tuple(tag.id for tag in self.limb) + tuple(tag.id for tag in self.world)
 
     @property
+    def limb_names(self) -> dict[int, str]:
+        """Names of the limb's tags by their ids."""
+        return {tag.id: str(tag.id) for tag in self.limb}
+
+    @property
     def length(self) -> float:
         """Arc length of the tip at rest [m]."""
         return sum(self.segment_lengths)

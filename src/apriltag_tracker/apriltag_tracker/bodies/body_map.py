@@ -101,6 +101,11 @@ class BodyMap:
     frame: BaseFrame | None = None
 
     @property
+    def limb_names(self) -> dict[int, str]:
+        """Names of the limb's bodies by their ids, which are their places in ``limb``."""
+        return {place: body.name for place, body in enumerate(self.limb)}
+
+    @property
     def length(self) -> float:
         """Arc length of the tip at rest [m]."""
         return sum(self.segment_lengths)

@@ -145,8 +145,7 @@ class BodyTracker:
         survey, least = self._options.uncertainty.survey, 0.01 if len(fixed) > 1 else bodies.length
         self._shared = partial(survey_errors, fixed=fixed, survey=survey, least_spread=least)
         self.plane = PlaneWatch(np.array([body.height for body in bodies.limb]))
-        names = {place: body.name for place, body in enumerate(bodies.limb)}
-        self.follower = LimbFollower(bodies, names, self._options, "body", "in the poses")
+        self.follower = LimbFollower(bodies, self._options, "body", "in the poses")
         self._index = [bodies.names.index(body.name) for body in bodies.limb]
         self._arcs = np.array([body.arc_length for body in bodies.limb])
         self._turns = np.array([body.rotation for body in bodies.limb])

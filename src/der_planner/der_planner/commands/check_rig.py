@@ -26,7 +26,7 @@ import yaml
 
 from apriltag_tracker.bodies.body_map import BodyMap
 from apriltag_tracker.pose.clamp import Clamp, at_clamp, find_clamp
-from apriltag_tracker.tag_map import LimbTag, MapError, TagMap
+from apriltag_tracker.tag_map import MapError, TagMap
 from der_planner.bags.reader import BagError, BagReader
 from der_planner.bags.record import PRESSURE_TYPE, Columns, header_stamp
 from der_planner.experiment.console import (
@@ -223,11 +223,7 @@ def read_check(path: Path, bodies: TagMap | BodyMap) -> RigLog:
         RigError: it holds no pressures, or nothing was seen of the limb.
         BagError: the bag cannot be read.
     """
-    # The id of a body is its place in the map.
-    limb = {
-        body.id if isinstance(body, LimbTag) else place: place
-        for place, body in enumerate(bodies.limb)
-    }
+    limb = {each: place for place, each in enumerate(bodies.limb_names)}
     commands, measured, opening, places = Columns(), Columns(), Columns(), Columns()
     with BagReader(path) as bag:
         kinds = {name: topic.type_name for name, topic in bag.topics.items()}
@@ -259,9 +255,7 @@ def read_check(path: Path, bodies: TagMap | BodyMap) -> RigLog:
         opening=opening.values(2 * count),
         seen_time=1e-9 * (places.stamps() - first),
         places=seen,
-        names=tuple(
-            str(body.id if isinstance(body, LimbTag) else body.name) for body in bodies.limb
-        ),
+        names=tuple(bodies.limb_names.values()),
         arc_lengths=np.array([body.arc_length for body in bodies.limb]),
         segment_lengths=bodies.segment_lengths,
     )
