@@ -147,9 +147,8 @@ class BodyTracker:
         self.plane = PlaneWatch(np.array([body.height for body in bodies.limb]))
         self.follower = LimbFollower(bodies, self._options, "body", "in the poses")
         self._index = [bodies.names.index(body.name) for body in bodies.limb]
-        self._arcs = np.array([body.arc_length for body in bodies.limb])
         self._turns = np.array([body.rotation for body in bodies.limb])
-        self._before: Array | None = None
+        self._before = np.full((len(bodies.names), 7), np.nan)
         self._same = np.zeros(len(bodies.names), dtype=np.int64)
 
     def observe(self, frame: PoseFrame) -> BodyObservation:
@@ -159,10 +158,9 @@ class BodyTracker:
         norms = np.linalg.norm(frame.quaternions, axis=1)
         lost = ~(np.isfinite(positions).all(axis=1) & (np.abs(norms - 1.0) < 0.1))
         lost |= self._frozen(frame)
-        rotations = np.tile(np.eye(3), (len(lost), 1, 1))
-        if not lost.all():
-            rotations[~lost] = Rotation.from_quat(frame.quaternions[~lost]).as_matrix()
-        positions = np.where(lost[:, None], np.nan, positions)
+        quaternions = np.where(lost[:, None], [0.0, 0.0, 0.0, 1.0], frame.quaternions)
+        rotations = Rotation.from_quat(quaternions).as_matrix()
+        positions[lost], rotations[lost] = np.nan, np.nan
         places = np.full((len(self._index), 3), np.nan)
         base = self.base.update(positions, rotations)
         if base is None:
@@ -171,29 +169,20 @@ class BodyTracker:
         axes = base.rotation @ rotations[self._index] @ self._turns.transpose(0, 2, 1)
         self.plane.take(points)
         places[:, :2] = points[:, :2]
-        places[:, 2] = np.where(
-            np.isfinite(points[:, 0]), np.arctan2(axes[:, 1, 0], axes[:, 0, 0]), np.nan
-        )
-        seen = np.flatnonzero(np.isfinite(places).all(axis=1))
-        planar = [
-            PlanarTag(
-                int(k),
-                float(self._arcs[k]),
-                centreline_pose(places[k], self.bodies.limb[k].offset),
-                self._covariance,
-            )
-            for k in seen
-        ]
+        places[:, 2] = np.arctan2(axes[:, 1, 0], axes[:, 0, 0])
+        seen = np.flatnonzero(np.isfinite(places).all(axis=1)).tolist()
+        planar = []
+        for k in seen:
+            body = self.bodies.limb[k]
+            pose = centreline_pose(places[k], body.offset)
+            planar.append(PlanarTag(k, body.arc_length, pose, self._covariance))
         followed = self.follower.follow(planar, stamp, self._shared(places[seen]))
         return BodyObservation(followed, places)
 
     def _frozen(self, frame: PoseFrame) -> NDArray[np.bool_]:
         """Return which bodies keep their pose to the last digit while others move, (n,)."""
         now = np.hstack([frame.positions, frame.quaternions])
-        if self._before is None:
-            self._before = now
-        same = (now == self._before).all(axis=1)
-        self._same = np.where(same, self._same + 1, 0)
+        self._same = np.where((now == self._before).all(axis=1), self._same + 1, 0)
         self._before = now
         frozen = self._same >= _FROZEN_FRAMES
         return frozen if not frozen[np.isfinite(now).all(axis=1)].all() else np.zeros_like(frozen)

@@ -13,7 +13,6 @@ be played; 3: it contradicts itself, and no file is written; 1: an error; 2: bad
 from __future__ import annotations
 
 import argparse
-import copy
 import sys
 import time
 from collections.abc import Mapping
@@ -93,7 +92,7 @@ def _main(given: argparse.Namespace) -> int:
         content["twin"] = {"wiring": list(Wiring(tuple(given.wiring)).chambers)}
     if given.poses:
         content["poses"] = {}
-    hardware = Hardware(**copy.deepcopy(content))
+    hardware = Hardware(**content)
     if given.hardware:
         hardware = Hardware.from_yaml(given.hardware)
         content = yaml.safe_load(given.hardware.read_text())

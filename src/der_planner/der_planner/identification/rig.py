@@ -288,9 +288,7 @@ def _judge(log: RigLog, valve: int, fill: tuple[float, float], bends: Array) -> 
     start, end = fill
     problems: list[str] = []
     wanted = float(np.abs(log.command).max())
-    sensor, rise, sensor_sure = _largest(
-        _change(log.time, log.measured, fill), LEAST_RISE * wanted
-    )
+    sensor, rise, sensor_sure = _largest(_change(log.time, log.measured, fill), LEAST_RISE * wanted)
     segment, bend, bend_sure = _largest(_change(log.seen_time, bends, fill), LEAST_BEND)
     answered = moved = float("nan")
     if sensor is not None:
