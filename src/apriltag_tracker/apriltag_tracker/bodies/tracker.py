@@ -23,6 +23,8 @@ from apriltag_tracker.pose.shape import PlanarTag, centreline_pose
 
 Array = NDArray[np.float64]
 
+_SAME_INSTANT = 1_000_000
+"""Stamps that are nearer than this belong to one frame [ns]."""
 _OPEN_FRAMES = 2
 """A body that is missing is waited for until so many later frames have begun."""
 _FROZEN_FRAMES = 3
@@ -53,12 +55,10 @@ class FrameAssembler:
 
     Args:
         bodies: the body map.
-        tolerance: stamps that are nearer than this belong to one frame [ns].
     """
 
-    def __init__(self, bodies: BodyMap, tolerance: int = 1_000_000) -> None:
+    def __init__(self, bodies: BodyMap) -> None:
         self._places = {name: place for place, name in enumerate(bodies.names)}
-        self._tolerance = tolerance
         self._open: list[tuple[PoseFrame, set[int]]] = []
         self._closed: int | None = None
         self._expected = set(self._places.values())
@@ -71,14 +71,14 @@ class FrameAssembler:
         if place is None:
             self.unknown[name] = self.unknown.get(name, 0) + 1
             return []
-        if self._closed is not None and stamp <= self._closed + self._tolerance:
+        if self._closed is not None and stamp <= self._closed + _SAME_INSTANT:
             if stamp > self._closed - _CLOCK_SET:
                 # Of a frame that was told already: the next one waits for this body, too.
                 self._expected.add(place)
                 return []
             self._open, self._closed = [], None
-        at = bisect.bisect(self._open, stamp - self._tolerance - 1, key=lambda each: each[0].stamp)
-        if at == len(self._open) or self._open[at][0].stamp > stamp + self._tolerance:
+        at = bisect.bisect(self._open, stamp - _SAME_INSTANT - 1, key=lambda each: each[0].stamp)
+        if at == len(self._open) or self._open[at][0].stamp > stamp + _SAME_INSTANT:
             count = len(self._places)
             frame = PoseFrame(stamp, np.full((count, 3), np.nan), np.full((count, 4), np.nan))
             self._open.insert(at, (frame, set()))
