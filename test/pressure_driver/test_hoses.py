@@ -21,8 +21,8 @@ def test_a_command_fills_the_valves_that_feed_the_chambers(simulate, protocol, w
 @pytest.mark.parametrize(
     ("protocol", "wiring", "said"),
     [
-        ("native", "1,2,3", "valves 1 to 4 once"),
-        ("native", "1,1,2,3", "valves 1 to 4 once"),
+        ("native", "1,2,3", "name each of 1, 2, 3, 4 once"),
+        ("native", "1,1,2,3", "name each of 1, 2, 3, 4 once"),
         ("ezloop", "1,3,2,4", "hoses of each segment on one pair"),
     ],
 )

@@ -12,7 +12,6 @@ from collections.abc import Iterator
 from dataclasses import MISSING, Field, dataclass, field, fields
 from typing import Any, NamedTuple, TypeVar
 
-from pressure_driver.following import valves_of
 from pressure_driver.protocols import NAMES
 
 TERMINALS = ("vtem", "mpa")
@@ -23,6 +22,27 @@ SENSOR_RANGE = "of the sensors of a `pneudrive` board, whose counts are a thousa
 
 class SettingError(ValueError):
     """A parameter has a value that the driver cannot work with; the message names both."""
+
+
+def order_of(text: str, count: int, first: int = 1, name: str = "wiring") -> tuple[int, ...]:
+    """Return the numbers (count,), counted from 0, of a parameter like `wiring`.
+
+    Args:
+        text: each number once; empty: in order.
+        count: of them.
+        first: the smallest one.
+        name: of the parameter.
+
+    Raises:
+        SettingError: it does not name each of them once.
+    """
+    usual = [str(first + k) for k in range(count)]
+    named = text.replace(",", " ").split() or usual
+    if sorted(named) != sorted(usual):
+        raise SettingError(
+            f"parameter '{name}' is '{text}': name each of {', '.join(usual)} once, in any order"
+        )
+    return tuple(int(number) - first for number in named)
 
 
 class Declaration(NamedTuple):
@@ -159,14 +179,7 @@ class Settings:
                     f"parameters '{low}' ({below:g} Pa) and '{high}' ({above:g} Pa): the first "
                     f"must be smaller{reason}"
                 )
-        count = 2 * self.segment_count
-        try:
-            valves = valves_of(self.wiring, count)
-        except ValueError as error:
-            raise SettingError(
-                f"parameter 'wiring' is '{self.wiring}': name each of the valves 1 to {count} "
-                "once, in the order of the limb's chambers"
-            ) from error
+        valves = self.valves
         if self.protocol == "ezloop" and any(
             left // 2 != right // 2 for left, right in zip(valves[0::2], valves[1::2], strict=True)
         ):
@@ -181,6 +194,11 @@ class Settings:
                 f"parameters 'command_validity' ({self.command_validity:g} s) and 'rate' "
                 f"({self.rate:g} Hz): a command must stay valid until the next tick"
             )
+
+    @property
+    def valves(self) -> tuple[int, ...]:
+        """The valve of each chamber (2M,), counted from 0."""
+        return order_of(self.wiring, 2 * self.segment_count)
 
 
 @dataclass(frozen=True)
@@ -198,6 +216,9 @@ class EmulatorSettings:
     sensor_range: float = _number(689_500.0, "Pa", 1e3, 1e7, SENSOR_RANGE)
     segment_count: int = _number(2, "", 1, 16, "pairs of chambers")
     seed: int = _number(0, "", 0, 2**62, "of sensors, valves and the day's atmosphere")
+    wiring: str = _other(
+        "", "chamber of the limb that each valve fills, as 3,4,2,1; empty: each its own"
+    )
     reset_on_open: bool = _other(True, "opening the port restarts the board")
     real_time_priority: int = _number(10, "", 0, 90, "SCHED_FIFO; 0: none")
     faults: str = _other("", 'e.g. "stick:1,leak:2"; may be set while it runs', changeable=True)

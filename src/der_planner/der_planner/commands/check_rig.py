@@ -44,7 +44,6 @@ from der_planner.limb import Limb
 from der_planner.twin import TwinError
 from der_planner.twin.wiring import Wiring
 from limb_interfaces import topics
-from pressure_driver.following import valves_of
 from pressure_driver.protocols import NAMES
 from pressure_driver.settings import SettingError, Settings
 
@@ -210,8 +209,7 @@ def played_wiring(finding: RigFinding, driver: Mapping[str, Any]) -> str:
         RigError: the rig contradicts itself.
     """
     present = Settings(**driver)
-    valves = valves_of(present.wiring, len(finding.valves))
-    found = ",".join(str(valves[channel] + 1) for channel in finding.wiring)
+    found = ",".join(str(present.valves[channel] + 1) for channel in finding.wiring)
     return replace(present, wiring=found).wiring
 
 
