@@ -70,7 +70,7 @@ class OfflineTwin:
         wiring: Wiring | None = None,
     ) -> None:
         self._wiring = wiring
-        hoses = wiring and [abs(chamber) - 1 for chamber in wiring.chambers]
+        hoses = [abs(chamber) - 1 for chamber in wiring.chambers] if wiring else None
         self.pneumatics = BoardPneumatics(segment_count, seed, hoses)
         atmosphere = self.pneumatics.atmosphere
         self.twin = LimbTwin(seed, run, atmosphere=atmosphere, gravity=gravity, masses=masses)
