@@ -42,8 +42,8 @@ BOARD_PARAMETERS = {"pneudrive": {"sensor_range": 103_400.0}}
 """Of boards of the twin: with sensors of 15 psi, a step is 0.13 kPa and not 0.84."""
 PAGE_TOKEN = secrets.token_urlsafe()
 """Opens the page of each run's graph, so that a window that is open stays let in."""
-POSE_RATE = 120.0
-"""Simulated motion capture tells poses so often [Hz]."""
+POSE_RATE = 60.0
+"""Simulated motion capture tells poses so often [Hz], as many as the tracker of bodies takes."""
 _PR_SET_PDEATHSIG = 1
 _LIBC = ctypes.CDLL(None)
 
