@@ -2,7 +2,8 @@
 
 import pytest
 
-from pressure_driver.settings import SettingError, Settings
+from pressure_driver.orders import SettingError
+from pressure_driver.settings import Settings
 
 
 @pytest.mark.parametrize(
