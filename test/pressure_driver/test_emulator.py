@@ -35,6 +35,12 @@ def test_filling_is_a_ramp_and_lifts_the_neighbour_for_a_second(seed):
     assert np.all(np.abs(gauge[:, 2:]) < 1e-9)
 
 
+def test_a_chamber_lifts_its_neighbour_in_the_limb_whatever_the_hoses():
+    gauge = trace(BoardPneumatics(2, 1, [3, 0, 2, 1]), [0.0, 7000.0, 0.0, 0.0], 1.0)[-1]
+    assert gauge[3] > 800.0
+    assert np.all(np.abs(gauge[[0, 2]]) < 1e-9)
+
+
 @pytest.mark.parametrize("seed", SEEDS)
 def test_venting_takes_its_time_and_ends(seed):
     air = BoardPneumatics(2, seed)

@@ -2,7 +2,8 @@
 
 import pytest
 
-from pressure_driver.settings import SettingError, Settings
+from pressure_driver.orders import SettingError
+from pressure_driver.settings import Settings
 
 
 @pytest.mark.parametrize(
@@ -21,8 +22,8 @@ def test_a_command_fills_the_valves_that_feed_the_chambers(simulate, protocol, w
 @pytest.mark.parametrize(
     ("protocol", "wiring", "said"),
     [
-        ("native", "1,2,3", "valves 1 to 4 once"),
-        ("native", "1,1,2,3", "valves 1 to 4 once"),
+        ("native", "1,2,3", "name each of 1, 2, 3, 4 once"),
+        ("native", "1,1,2,3", "name each of 1, 2, 3, 4 once"),
         ("ezloop", "1,3,2,4", "hoses of each segment on one pair"),
     ],
 )

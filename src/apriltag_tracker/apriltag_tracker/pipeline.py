@@ -92,8 +92,7 @@ class LimbTracker:
             )
         self.tracker = TagTracker(self._flat, detector, self.options.full_search_period)
         self.world = WorldPose(tags, intrinsics)
-        names = {tag.id: str(tag.id) for tag in tags.limb}
-        self.follower = LimbFollower(tags, names, self.options)
+        self.follower = LimbFollower(tags, self.options)
 
     def observe(
         self, gray: NDArray[np.uint8], stamp: float, search_later: bool = False

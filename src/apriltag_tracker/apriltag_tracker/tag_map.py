@@ -95,6 +95,11 @@ class TagMap:
         return tuple(tag.id for tag in self.limb) + tuple(tag.id for tag in self.world)
 
     @property
+    def limb_names(self) -> dict[int, str]:
+        """Names of the limb's tags by their ids."""
+        return {tag.id: str(tag.id) for tag in self.limb}
+
+    @property
     def length(self) -> float:
         """Arc length of the tip at rest [m]."""
         return sum(self.segment_lengths)
@@ -171,6 +176,18 @@ def limb_geometry(
     return lengths, _stiff(limb.get("stiff") or [], lengths)
 
 
+def on_limb(
+    entry: dict[str, Any], total: float, name: str
+) -> tuple[float, float, tuple[float, float, float]]:
+    """Read arc length [m], height [m] and offset of what is on the limb; raises `MapError`."""
+    arc_length = number(entry.get("arc_length"), f"{name}: arc_length")
+    if not 0.0 <= arc_length <= total:
+        raise MapError(f"{name}: arc_length {arc_length} m is not on the limb (0 to {total} m)")
+    height = number(entry.get("height"), f"{name}: height")
+    along, across, angle = floats(entry.get("offset", [0.0, 0.0, 0.0]), 3, f"{name}: offset")
+    return arc_length, height, (along, across, angle)
+
+
 def section(data: dict[str, Any], name: str) -> dict[str, Any]:
     """Return a part of a map that must be there; raises `MapError`."""
     found = data.get(name)
@@ -229,12 +246,8 @@ def _common(entry: Any, where: str, family: Family) -> tuple[int, float, str]:
 
 def _limb_tag(entry: Any, total: float, family: Family) -> LimbTag:
     tag, size, name = _common(entry, "limb tag", family)
-    arc_length = number(entry.get("arc_length"), f"{name}: arc_length")
-    if not 0.0 <= arc_length <= total:
-        raise MapError(f"{name}: arc_length {arc_length} m is not on the limb (0 to {total} m)")
-    offset = floats(entry.get("offset", [0.0, 0.0, 0.0]), 3, f"{name}: offset")
-    height = number(entry.get("height"), f"{name}: height")
-    return LimbTag(tag, arc_length, height, size, (offset[0], offset[1], offset[2]))
+    arc_length, height, offset = on_limb(entry, total, name)
+    return LimbTag(tag, arc_length, height, size, offset)
 
 
 def _world_tag(entry: Any, family: Family) -> WorldTag:

@@ -12,23 +12,22 @@ import numpy as np
 SILENCE = 2.0
 """Without an image or a frame of poses for this long [s] something is wrong."""
 _WINDOW = 300
+_INTERVALS = 100
+"""So many tell the period of a stream."""
+_PAUSE = 5_000_000_000
+"""[ns] A longer gap is a source that paused."""
 
 
 class StampGaps:
     """Counts what is missing between the stamps of a stream of nearly constant rate.
 
-    The period is the interval below which a tenth of the last `window` ones lie: so even if most
-    messages are lost, the few neighbours that both arrive tell it. A gap of k periods is k − 1
-    missed messages; one longer than ``pause`` is a source that paused, and counts none.
-
-    Args:
-        window: intervals that tell the period.
-        pause: [s].
+    The period is the interval below which a tenth of the last ones lie: so even if most messages
+    are lost, the few neighbours that both arrive tell it. A gap of k periods is k − 1 missed
+    messages.
     """
 
-    def __init__(self, window: int = 100, pause: float = 5.0) -> None:
-        self._intervals: collections.deque[int] = collections.deque(maxlen=window)
-        self._pause = round(pause * 1e9)
+    def __init__(self) -> None:
+        self._intervals: collections.deque[int] = collections.deque(maxlen=_INTERVALS)
         self._newest = 0
         self.missed = 0
         """Messages that did not arrive between those that did."""
@@ -39,7 +38,7 @@ class StampGaps:
             return
         before, self._newest = self._newest, stamp
         interval = stamp - before
-        if before == 0 or not 0 < interval <= self._pause:
+        if before == 0 or not 0 < interval <= _PAUSE:
             return
         self._intervals.append(interval)
         if len(self._intervals) >= 2:

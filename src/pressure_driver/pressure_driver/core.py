@@ -11,7 +11,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from pressure_driver.following import chamber_gauge, valves_of
+from pressure_driver.following import chamber_gauge
+from pressure_driver.orders import order_of
 from pressure_driver.protocols import (
     STANDARD_ATMOSPHERE,
     BoardFailure,
@@ -146,7 +147,7 @@ class DriverCore:
         self.monitor = TelemetryMonitor(protocol, settings)
         self.machine = SafetyMachine(settings, self.monitor, self._conditions)
         self.board = BoardWatch(protocol, settings)
-        self._valves = valves_of(settings.wiring, protocol.chamber_count)
+        self._valves = order_of(settings.wiring, protocol.chamber_count)
         self._log = log
         self._link_fault = "the serial port is not open"
         self._texts: deque[str] = deque()

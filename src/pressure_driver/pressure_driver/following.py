@@ -25,24 +25,6 @@ def chamber_gauge(differential: Sequence[float]) -> list[float]:
     return [gauge for value in differential for gauge in (max(value, 0.0), max(-value, 0.0))]
 
 
-def valves_of(wiring: str, chamber_count: int, first: int = 1) -> tuple[int, ...]:
-    """Return the valve of each chamber (2M,), counted from 0, for a parameter like ``wiring``.
-
-    Args:
-        wiring: numbers of the valves; empty: each chamber has its own.
-        chamber_count: 2M.
-        first: number of the first valve.
-
-    Raises:
-        ValueError: it does not name every valve once.
-    """
-    valves = tuple(range(chamber_count))
-    named = tuple(int(word) - first for word in wiring.replace(",", " ").split()) or valves
-    if tuple(sorted(named)) != valves:
-        raise ValueError(wiring)
-    return named
-
-
 class Duration:
     """How long something has gone on without a break."""
 

@@ -12,17 +12,13 @@ from collections.abc import Iterator
 from dataclasses import MISSING, Field, dataclass, field, fields
 from typing import Any, NamedTuple, TypeVar
 
-from pressure_driver.following import valves_of
+from pressure_driver.orders import SettingError, order_of
 from pressure_driver.protocols import NAMES
 
 TERMINALS = ("vtem", "mpa")
 TERMINAL = "valves of a `festo` terminal: a motion terminal, or VPPM regulators"
 DEVICE = "number of a `pneudrive` board, which its address follows from"
 SENSOR_RANGE = "of the sensors of a `pneudrive` board, whose counts are a thousandth of it"
-
-
-class SettingError(ValueError):
-    """A parameter has a value that the driver cannot work with; the message names both."""
 
 
 class Declaration(NamedTuple):
@@ -159,14 +155,7 @@ class Settings:
                     f"parameters '{low}' ({below:g} Pa) and '{high}' ({above:g} Pa): the first "
                     f"must be smaller{reason}"
                 )
-        count = 2 * self.segment_count
-        try:
-            valves = valves_of(self.wiring, count)
-        except ValueError as error:
-            raise SettingError(
-                f"parameter 'wiring' is '{self.wiring}': name each of the valves 1 to {count} "
-                "once, in the order of the limb's chambers"
-            ) from error
+        valves = self.valves
         if self.protocol == "ezloop" and any(
             left // 2 != right // 2 for left, right in zip(valves[0::2], valves[1::2], strict=True)
         ):
@@ -181,6 +170,11 @@ class Settings:
                 f"parameters 'command_validity' ({self.command_validity:g} s) and 'rate' "
                 f"({self.rate:g} Hz): a command must stay valid until the next tick"
             )
+
+    @property
+    def valves(self) -> tuple[int, ...]:
+        """The valve of each chamber (2M,), counted from 0."""
+        return order_of(self.wiring, 2 * self.segment_count)
 
 
 @dataclass(frozen=True)
@@ -198,6 +192,9 @@ class EmulatorSettings:
     sensor_range: float = _number(689_500.0, "Pa", 1e3, 1e7, SENSOR_RANGE)
     segment_count: int = _number(2, "", 1, 16, "pairs of chambers")
     seed: int = _number(0, "", 0, 2**62, "of sensors, valves and the day's atmosphere")
+    wiring: str = _other(
+        "", "chamber of the limb that each valve fills, as 3,4,2,1; empty: each its own"
+    )
     reset_on_open: bool = _other(True, "opening the port restarts the board")
     real_time_priority: int = _number(10, "", 0, 90, "SCHED_FIFO; 0: none")
     faults: str = _other("", 'e.g. "stick:1,leak:2"; may be set while it runs', changeable=True)

@@ -66,11 +66,12 @@ def test_a_node_of_another_computer_is_marked_and_keeps_its_parameters_there(tmp
 
 def test_a_rig_file_of_a_twin_needs_no_board_and_no_limb_file(tmp_path: Path):
     rig = tmp_path / "rig.yaml"
-    rig.write_text("driver: {protocol: native, wiring: '2,1,4,3'}\ntwin: {wiring: [2, 1, 4, 3]}\n")
+    rig.write_text("driver: {protocol: native, wiring: '2,1,4,3'}\ntwin: {wiring: [2, -1, 4, 3]}\n")
     options = parse(["--hardware", str(rig)])
     nodes = GraphSetup(tmp_path, {}, hardware=options.hardware).nodes("/tmp/board")
     found = {node.executable: node.parameters for node in nodes}
-    assert found["limb_twin"]["wiring"] == [2, 1, 4, 3]
+    assert found["limb_twin"]["wiring"] == [2, -1, 4, 3]
+    assert found["board_emulator"]["wiring"] == "2,1,4,3"
     assert found["board_emulator"]["protocol"] == found["pressure_driver"]["protocol"] == "native"
     assert found["pressure_driver"]["wiring"] == "2,1,4,3"
 

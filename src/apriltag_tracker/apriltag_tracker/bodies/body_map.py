@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from apriltag_tracker.tag_map import MapError, floats, limb_geometry, number, read_map, section
+from apriltag_tracker.tag_map import MapError, floats, limb_geometry, on_limb, read_map, section
 
 SCHEMA_VERSION = 1
 LENGTH_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
@@ -101,6 +101,11 @@ class BodyMap:
     frame: BaseFrame | None = None
 
     @property
+    def limb_names(self) -> dict[int, str]:
+        """Names of the limb's bodies by their ids, which are their places in ``limb``."""
+        return {place: body.name for place, body in enumerate(self.limb)}
+
+    @property
     def length(self) -> float:
         """Arc length of the tip at rest [m]."""
         return sum(self.segment_lengths)
@@ -159,13 +164,8 @@ def _body(entry: Any, total: float) -> BodyOnLimb | FixedBody:
             raise MapError(f"{name}: an arc_length, or 'place: clamp' or 'place: world' needed")
         position = floats(entry.get("position"), 3, f"{name}: position")
         return FixedBody(entry["name"], np.array(position), turn)
-    arc_length = number(entry["arc_length"], f"{name}: arc_length")
-    if not 0.0 <= arc_length <= total:
-        raise MapError(f"{name}: arc_length {arc_length} m is not on the limb (0 to {total} m)")
-    along, across, angle = floats(entry.get("offset", [0.0, 0.0, 0.0]), 3, f"{name}: offset")
-    height = number(entry.get("height", 0.0), f"{name}: height")
-    rotation = np.eye(3) if turn is None else turn
-    return BodyOnLimb(entry["name"], arc_length, height, (along, across, angle), rotation)
+    place = on_limb({"height": 0.0, **entry}, total, name)
+    return BodyOnLimb(entry["name"], *place, np.eye(3) if turn is None else turn)
 
 
 def _rotation(value: Any, name: str) -> NDArray[np.float64]:

@@ -23,6 +23,8 @@ from apriltag_tracker.pose.shape import PlanarTag, centreline_pose
 
 Array = NDArray[np.float64]
 
+_SAME_INSTANT = 1_000_000
+"""Stamps that are nearer than this belong to one frame [ns]."""
 _OPEN_FRAMES = 2
 """A body that is missing is waited for until so many later frames have begun."""
 _FROZEN_FRAMES = 3
@@ -53,12 +55,10 @@ class FrameAssembler:
 
     Args:
         bodies: the body map.
-        tolerance: stamps that are nearer than this belong to one frame [ns].
     """
 
-    def __init__(self, bodies: BodyMap, tolerance: int = 1_000_000) -> None:
+    def __init__(self, bodies: BodyMap) -> None:
         self._places = {name: place for place, name in enumerate(bodies.names)}
-        self._tolerance = tolerance
         self._open: list[tuple[PoseFrame, set[int]]] = []
         self._closed: int | None = None
         self._expected = set(self._places.values())
@@ -71,14 +71,14 @@ class FrameAssembler:
         if place is None:
             self.unknown[name] = self.unknown.get(name, 0) + 1
             return []
-        if self._closed is not None and stamp <= self._closed + self._tolerance:
+        if self._closed is not None and stamp <= self._closed + _SAME_INSTANT:
             if stamp > self._closed - _CLOCK_SET:
                 # Of a frame that was told already: the next one waits for this body, too.
                 self._expected.add(place)
                 return []
             self._open, self._closed = [], None
-        at = bisect.bisect(self._open, stamp - self._tolerance - 1, key=lambda each: each[0].stamp)
-        if at == len(self._open) or self._open[at][0].stamp > stamp + self._tolerance:
+        at = bisect.bisect(self._open, stamp - _SAME_INSTANT - 1, key=lambda each: each[0].stamp)
+        if at == len(self._open) or self._open[at][0].stamp > stamp + _SAME_INSTANT:
             count = len(self._places)
             frame = PoseFrame(stamp, np.full((count, 3), np.nan), np.full((count, 4), np.nan))
             self._open.insert(at, (frame, set()))
@@ -145,12 +145,10 @@ class BodyTracker:
         survey, least = self._options.uncertainty.survey, 0.01 if len(fixed) > 1 else bodies.length
         self._shared = partial(survey_errors, fixed=fixed, survey=survey, least_spread=least)
         self.plane = PlaneWatch(np.array([body.height for body in bodies.limb]))
-        names = {place: body.name for place, body in enumerate(bodies.limb)}
-        self.follower = LimbFollower(bodies, names, self._options, "body", "in the poses")
+        self.follower = LimbFollower(bodies, self._options, "body", "in the poses")
         self._index = [bodies.names.index(body.name) for body in bodies.limb]
-        self._arcs = np.array([body.arc_length for body in bodies.limb])
         self._turns = np.array([body.rotation for body in bodies.limb])
-        self._before: Array | None = None
+        self._before = np.full((len(bodies.names), 7), np.nan)
         self._same = np.zeros(len(bodies.names), dtype=np.int64)
 
     def observe(self, frame: PoseFrame) -> BodyObservation:
@@ -160,10 +158,9 @@ class BodyTracker:
         norms = np.linalg.norm(frame.quaternions, axis=1)
         lost = ~(np.isfinite(positions).all(axis=1) & (np.abs(norms - 1.0) < 0.1))
         lost |= self._frozen(frame)
-        rotations = np.tile(np.eye(3), (len(lost), 1, 1))
-        if not lost.all():
-            rotations[~lost] = Rotation.from_quat(frame.quaternions[~lost]).as_matrix()
-        positions = np.where(lost[:, None], np.nan, positions)
+        quaternions = np.where(lost[:, None], [0.0, 0.0, 0.0, 1.0], frame.quaternions)
+        rotations = Rotation.from_quat(quaternions).as_matrix()
+        positions[lost], rotations[lost] = np.nan, np.nan
         places = np.full((len(self._index), 3), np.nan)
         base = self.base.update(positions, rotations)
         if base is None:
@@ -172,29 +169,20 @@ class BodyTracker:
         axes = base.rotation @ rotations[self._index] @ self._turns.transpose(0, 2, 1)
         self.plane.take(points)
         places[:, :2] = points[:, :2]
-        places[:, 2] = np.where(
-            np.isfinite(points[:, 0]), np.arctan2(axes[:, 1, 0], axes[:, 0, 0]), np.nan
-        )
-        seen = np.flatnonzero(np.isfinite(places).all(axis=1))
-        planar = [
-            PlanarTag(
-                int(k),
-                float(self._arcs[k]),
-                centreline_pose(places[k], self.bodies.limb[k].offset),
-                self._covariance,
-            )
-            for k in seen
-        ]
+        places[:, 2] = np.arctan2(axes[:, 1, 0], axes[:, 0, 0])
+        seen = np.flatnonzero(np.isfinite(places).all(axis=1)).tolist()
+        planar = []
+        for k in seen:
+            body = self.bodies.limb[k]
+            pose = centreline_pose(places[k], body.offset)
+            planar.append(PlanarTag(k, body.arc_length, pose, self._covariance))
         followed = self.follower.follow(planar, stamp, self._shared(places[seen]))
         return BodyObservation(followed, places)
 
     def _frozen(self, frame: PoseFrame) -> NDArray[np.bool_]:
         """Return which bodies keep their pose to the last digit while others move, (n,)."""
         now = np.hstack([frame.positions, frame.quaternions])
-        if self._before is None:
-            self._before = now
-        same = (now == self._before).all(axis=1)
-        self._same = np.where(same, self._same + 1, 0)
+        self._same = np.where((now == self._before).all(axis=1), self._same + 1, 0)
         self._before = now
         frozen = self._same >= _FROZEN_FRAMES
         return frozen if not frozen[np.isfinite(now).all(axis=1)].all() else np.zeros_like(frozen)

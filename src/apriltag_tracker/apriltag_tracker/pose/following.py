@@ -5,7 +5,7 @@ The pictures' bodies may be tags of a camera or rigid bodies of a motion capture
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -100,8 +100,7 @@ class LimbFollower:
     """Fits the limb to what is seen of it, picture after picture.
 
     Args:
-        geometry: of the limb.
-        names: of everything that can be seen on it, by id.
+        geometry: of the limb, with the names of what can be seen on it.
         options: how it works.
         noun: what is seen: ``tag`` or ``body``.
         place: where it is seen: ``in the image``.
@@ -110,12 +109,11 @@ class LimbFollower:
     def __init__(
         self,
         geometry: LimbGeometry,
-        names: Mapping[int, str],
         options: FollowerOptions,
         noun: str = "tag",
         place: str = "in the image",
     ) -> None:
-        self._names = names
+        self._names = geometry.limb_names
         self._options = options
         self._noun, self._place = noun, place
         uncertainty = options.uncertainty

@@ -33,6 +33,10 @@ class LimbGeometry(Protocol):
     def length(self) -> float:
         """Arc length of the tip at rest [m]."""
 
+    @property
+    def limb_names(self) -> dict[int, str]:
+        """Names of what is on the limb, by id, in the order of the map."""
+
 
 @dataclass(frozen=True)
 class PlanarTag:

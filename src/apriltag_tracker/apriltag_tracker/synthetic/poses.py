@@ -15,6 +15,9 @@ from apriltag_tracker.synthetic.shapes import Shape
 UPRIGHT = {"z": (0.0, 0.0, 0.0), "y": (-np.pi / 2, 0.0, 0.0), "x": (0.0, np.pi / 2, 0.0)}
 """The turn that brings z to each axis, about an axis [rad]."""
 
+TURN = 0.3
+"""Of `limb_base` about the axis that is up, in the frame of the poses [rad]."""
+
 
 @dataclass(frozen=True)
 class MocapFaults:
@@ -43,7 +46,6 @@ class SyntheticMocap:
     Args:
         bodies: the body map; poses come in its unit.
         faults: what is wrong with them.
-        turn: of `limb_base` about the axis that is up, in the frame of the poses [rad].
         tilt: of the plane of motion against the floor [rad].
         seed: of noise and dropouts.
         up: axis of the poses' frame that points up, of `UPRIGHT`.
@@ -56,7 +58,6 @@ class SyntheticMocap:
         self,
         bodies: BodyMap,
         faults: MocapFaults | None = None,
-        turn: float = 0.3,
         tilt: float = 0.0,
         seed: int = 0,
         up: str = "z",
@@ -69,7 +70,7 @@ class SyntheticMocap:
         level = Rotation.from_rotvec(np.array(UPRIGHT[up]))
         # limb_base in the frame of the poses
         self.rotation: NDArray[np.float64] = (
-            level * Rotation.from_euler("zx", [turn, tilt])
+            level * Rotation.from_euler("zx", [TURN, tilt])
         ).as_matrix()
         self.origin = np.array([0.4, -0.2, 0.9])
         """Where the clamp is in the frame of the poses [m]."""

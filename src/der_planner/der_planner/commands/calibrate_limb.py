@@ -65,7 +65,7 @@ from der_planner.identification.excitation import (
     within_limits,
     write_excitation,
 )
-from der_planner.identification.foreign import ask_map, is_bag, read_bag_table
+from der_planner.identification.foreign import ask_map, is_bag
 from der_planner.identification.log import prepare
 from der_planner.identification.readers import is_ours, read_table
 from der_planner.identification.report import plot_prediction
@@ -330,7 +330,7 @@ def _columns(given: argparse.Namespace) -> Path | None:
         return path
     if is_bag(given.log) and is_ours(given.log):
         return None
-    names = list(read_bag_table(given.log) if is_bag(given.log) else read_table(given.log))
+    names = list(read_table(given.log))
     if not sys.stdin.isatty():
         raise LogError(
             f"{given.log} needs {path}, a map of its columns {', '.join(names)}: run this in a "

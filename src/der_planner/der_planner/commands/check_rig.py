@@ -13,7 +13,6 @@ be played; 3: it contradicts itself, and no file is written; 1: an error; 2: bad
 from __future__ import annotations
 
 import argparse
-import copy
 import sys
 import time
 from collections.abc import Mapping
@@ -26,7 +25,7 @@ import yaml
 
 from apriltag_tracker.bodies.body_map import BodyMap
 from apriltag_tracker.pose.clamp import Clamp, at_clamp, find_clamp
-from apriltag_tracker.tag_map import LimbTag, MapError, TagMap
+from apriltag_tracker.tag_map import MapError, TagMap
 from der_planner.bags.reader import BagError, BagReader
 from der_planner.bags.record import PRESSURE_TYPE, Columns, header_stamp
 from der_planner.experiment.console import (
@@ -45,9 +44,9 @@ from der_planner.limb import Limb
 from der_planner.twin import TwinError
 from der_planner.twin.wiring import Wiring
 from limb_interfaces import topics
-from pressure_driver.following import valves_of
+from pressure_driver.orders import SettingError
 from pressure_driver.protocols import NAMES
-from pressure_driver.settings import SettingError, Settings
+from pressure_driver.settings import Settings
 
 TAGS_TYPE = "der_msgs/msg/TagDetectionArray"
 CLAMP_OFF = (0.002, 0.002, float(np.deg2rad(1.5)))
@@ -93,7 +92,7 @@ def _main(given: argparse.Namespace) -> int:
         content["twin"] = {"wiring": list(Wiring(tuple(given.wiring)).chambers)}
     if given.poses:
         content["poses"] = {}
-    hardware = Hardware(**copy.deepcopy(content))
+    hardware = Hardware(**content)
     if given.hardware:
         hardware = Hardware.from_yaml(given.hardware)
         content = yaml.safe_load(given.hardware.read_text())
@@ -211,8 +210,7 @@ def played_wiring(finding: RigFinding, driver: Mapping[str, Any]) -> str:
         RigError: the rig contradicts itself.
     """
     present = Settings(**driver)
-    valves = valves_of(present.wiring, len(finding.valves))
-    found = ",".join(str(valves[channel] + 1) for channel in finding.wiring)
+    found = ",".join(str(present.valves[channel] + 1) for channel in finding.wiring)
     return replace(present, wiring=found).wiring
 
 
@@ -223,11 +221,7 @@ def read_check(path: Path, bodies: TagMap | BodyMap) -> RigLog:
         RigError: it holds no pressures, or nothing was seen of the limb.
         BagError: the bag cannot be read.
     """
-    # The id of a body is its place in the map.
-    limb = {
-        body.id if isinstance(body, LimbTag) else place: place
-        for place, body in enumerate(bodies.limb)
-    }
+    limb = {each: place for place, each in enumerate(bodies.limb_names)}
     commands, measured, opening, places = Columns(), Columns(), Columns(), Columns()
     with BagReader(path) as bag:
         kinds = {name: topic.type_name for name, topic in bag.topics.items()}
@@ -259,9 +253,7 @@ def read_check(path: Path, bodies: TagMap | BodyMap) -> RigLog:
         opening=opening.values(2 * count),
         seen_time=1e-9 * (places.stamps() - first),
         places=seen,
-        names=tuple(
-            str(body.id if isinstance(body, LimbTag) else body.name) for body in bodies.limb
-        ),
+        names=tuple(bodies.limb_names.values()),
         arc_lengths=np.array([body.arc_length for body in bodies.limb]),
         segment_lengths=bodies.segment_lengths,
     )

@@ -22,7 +22,7 @@ import yaml
 from der_planner.experiment.console import OptionError
 from der_planner.limb import Limb
 from der_planner.planning import Obstacles
-from pressure_driver.following import valves_of
+from pressure_driver.orders import order_of
 
 STOP_ORDER = (
     "planner",
@@ -42,8 +42,8 @@ BOARD_PARAMETERS = {"pneudrive": {"sensor_range": 103_400.0}}
 """Of boards of the twin: with sensors of 15 psi, a step is 0.13 kPa and not 0.84."""
 PAGE_TOKEN = secrets.token_urlsafe()
 """Opens the page of each run's graph, so that a window that is open stays let in."""
-POSE_RATE = 120.0
-"""Simulated motion capture tells poses so often [Hz]."""
+POSE_RATE = 60.0
+"""Simulated motion capture tells poses so often [Hz], as many as the tracker of bodies takes."""
 _PR_SET_PDEATHSIG = 1
 _LIBC = ctypes.CDLL(None)
 
@@ -200,7 +200,7 @@ class GraphSetup:
         driver = {"port": port, **(language if rig.twin is not None else {}), **rig.driver}
         wired = {}
         if wiring := driver.get("wiring"):
-            wired = {"wiring": valves_of(wiring, 2 * driver.get("segment_count", 2))}
+            wired = {"wiring": order_of(wiring, 2 * driver.get("segment_count", 2))}
         recorder = {
             "output": str(self.bag),
             "metadata": json.dumps(self.metadata | wired),
@@ -212,6 +212,8 @@ class GraphSetup:
         if rig.twin is not None:
             specs.insert(0, NodeSpec("pressure_driver", "board_emulator", board))
             twin |= rig.twin
+            if hoses := rig.twin.get("wiring"):
+                board["wiring"] = ",".join(str(abs(chamber)) for chamber in hoses)
             if self.obstacles is not None:
                 twin["pegs"] = self.obstacles.circles.ravel().tolist()
             camera = NodeSpec("apriltag_tracker", "synthetic_camera", {"seed": self.seed})

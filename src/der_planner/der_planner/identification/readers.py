@@ -206,7 +206,7 @@ def read_csv(path: str | Path, columns: ColumnMap) -> CalibrationLog:
         LogError: a column is missing or no number, a unit is unknown, or time falls; the message
             names it.
     """
-    table = read_bag_table(Path(path)) if is_bag(Path(path)) else read_table(Path(path))
+    table = read_table(Path(path))
     count = len(columns.chambers) // 2 if columns.poses else len(columns.angles)
     if len(columns.commanded) not in (count, 2 * count) or len(columns.chambers) != 2 * count:
         raise LogError(
@@ -317,6 +317,8 @@ def _rest(time: Array, command: Array, rest_until: float | str) -> NDArray[np.bo
 def read_table(path: Path) -> dict[str, Array]:
     """Return the columns (K,) of a table by the names in its header; missing numbers are NaN.
 
+    A bag has columns as `read_bag_table` says.
+
     Lines before the header that begin with ``#`` and empty lines are skipped, and a last row that
     ends early, as that of a program that was killed, is left out. Numbers may have a decimal comma
     where columns are separated by something else, or in quotes.
@@ -325,6 +327,8 @@ def read_table(path: Path) -> dict[str, Array]:
         LogError: the file cannot be read, names a column twice, has fewer than two rows or another
             number of columns in a row, or holds something that is no number; names row and column.
     """
+    if is_bag(path):
+        return read_bag_table(path)
     header_line, *lines = lines_of(path)
     separator = next((mark for mark in SEPARATORS if mark in header_line), ",")
     header = [name.strip() for name in next(csv.reader([header_line], delimiter=separator))]

@@ -17,13 +17,14 @@ import numpy as np
 from der_planner.arrays import Array
 from der_planner.identification.excitation import Excitation
 from der_planner.model import CONTROL_PERIOD
+from der_planner.model.air import pair_of
 
 GENTLE = 3000.0
 """Pressure of the fills [Pa]: a tenth of a right angle on the default limb."""
 REST, HOLD, VENT = 2.0, 3.0, 4.0
 """Before the first fill, of each fill, and after each [s]."""
 LEVEL = 0.5
-"""Levels are means over so long before something changes [s]."""
+"""Levels are means over so long [s]."""
 CROSSING = 0.1
 """A path has begun to answer at this share of its rise."""
 LEAST_RISE = 0.2
@@ -181,7 +182,7 @@ def find_rig(log: RigLog) -> RigFinding:
         RigError: a chamber was not filled in the log, or too little was seen of the limb.
     """
     fills = _fills(log)
-    ways = np.array([_change(log.seen_time, log.places[..., :2], fill)[0] for fill in fills])
+    ways = np.array([_change(log.seen_time, log.places[..., :2], fill) for fill in fills])
     blind = np.isnan(ways).any(axis=(0, 2))
     if blind.all():
         raise RigError("nothing was seen of the limb: does the tracker see its tags or bodies?")
@@ -215,45 +216,44 @@ def _fills(log: RigLog) -> list[tuple[float, float]]:
     Raises:
         RigError: one was not, or two were at once.
     """
-    filled = np.abs(log.command) > 0.5 * np.abs(log.command).max()
+    held = pair_of(log.command).reshape(len(log.time), -1)
+    filled = held > 0.5 * held.max()
     if not filled.any() or (filled.sum(axis=1) > 1).any():
         raise RigError("this is no log of a check: no chamber is filled, or two are at once")
     found = []
-    for valve in range(2 * log.command.shape[1]):
-        side = log.command[:, valve // 2] * (1 - 2 * (valve % 2)) > 0.0
-        rows = np.flatnonzero(filled[:, valve // 2] & side)
+    for valve, rows in enumerate(map(np.flatnonzero, filled.T), start=1):
         if not len(rows):
-            raise RigError(f"valve {valve + 1} was not filled in this log")
+            raise RigError(f"valve {valve} was not filled in this log")
         last = min(rows[-1] + 1, len(log.time) - 1)
         found.append((float(log.time[rows[0]]), float(log.time[last])))
     return found
 
 
-def _change(time: Array, values: Array, fill: tuple[float, float]) -> tuple[Array, Array]:
-    """Return how much values change in a fill, and the level from which they do."""
-    start, end = fill
-    before = values[(time >= start - LEVEL) & (time <= start)]
-    after = values[(time > end - LEVEL) & (time <= end)]
-    if not len(before) or not len(after):
-        raise RigError(f"nothing was recorded about the fill at {start:.1f} s")
-    level = _mean(before)
-    return _mean(after) - level, level
+def _level(time: Array, values: Array, until: float) -> Array:
+    """Return the mean of values shortly before an instant; NaN where fewer than half are known.
 
-
-def _mean(values: Array) -> Array:
-    """Return the mean over the rows that hold numbers; NaN where fewer than half do."""
-    known = np.isfinite(values)
+    Raises:
+        RigError: there are none.
+    """
+    rows = values[(time > until - LEVEL) & (time <= until)]
+    if not len(rows):
+        raise RigError(f"nothing was recorded shortly before {until:.1f} s")
+    known = np.isfinite(rows)
     count = known.sum(axis=0)
-    total = np.where(known, values, 0.0).sum(axis=0)
-    mean: Array = np.where(2 * count >= len(values), total / np.maximum(count, 1), np.nan)
-    return mean
+    mean = rows.sum(axis=0, where=known) / np.maximum(count, 1)
+    level: Array = np.where(2 * count >= len(rows), mean, np.nan)
+    return level
+
+
+def _change(time: Array, values: Array, fill: tuple[float, float]) -> Array:
+    """Return how much values change in a fill."""
+    return _level(time, values, fill[1]) - _level(time, values, fill[0])
 
 
 def _crossing(time: Array, values: Array, fill: tuple[float, float]) -> float:
     """Return when values have made `CROSSING` of their way in a fill [s], NaN if never."""
-    change, level = _change(time, values, fill)
-    rows = np.flatnonzero((time >= fill[0]) & (time <= fill[1]) & np.isfinite(values))
-    share = (values[rows] - level) / change
+    rows = (time >= fill[0]) & (time <= fill[1]) & np.isfinite(values)
+    share = (values[rows] - _level(time, values, fill[0])) / _change(time, values, fill)
     k = int(np.argmax(share >= CROSSING))
     if share[k] < CROSSING:
         return float("nan")
@@ -285,22 +285,21 @@ def _judge(log: RigLog, valve: int, fill: tuple[float, float], bends: Array) -> 
         fill: from when to when it was filled [s].
         bends: (J, M) of the segments [rad].
     """
+    start, end = fill
     problems: list[str] = []
     wanted = float(np.abs(log.command).max())
-    rises, levels = _change(log.time, log.measured, fill)
-    turns, _ = _change(log.seen_time, bends, fill)
-    sensor, rise, sensor_sure = _largest(rises, LEAST_RISE * wanted)
-    segment, bend, bend_sure = _largest(turns, LEAST_BEND)
-    answered, moved = fill[0], float("nan")
+    sensor, rise, sensor_sure = _largest(_change(log.time, log.measured, fill), LEAST_RISE * wanted)
+    segment, bend, bend_sure = _largest(_change(log.seen_time, bends, fill), LEAST_BEND)
+    answered = moved = float("nan")
     if sensor is not None:
-        answered = _crossing(log.time, log.measured[:, sensor], fill)
+        pressure = log.measured[:, sensor]
+        answered = _crossing(log.time, pressure, fill)
         short = 1.0 - rise / wanted
-        opening = _mean(log.opening[(log.time > fill[1] - LEVEL) & (log.time <= fill[1])])[valve]
+        opening = _level(log.time, log.opening, end)[valve]
         if short > LEAKS or opening > OPEN:
             below = f"{100 * short:.0f} % below its command, its inlet {100 * opening:.0f} % open"
             problems.append(f"it leaks or is fed too little: {below}")
-        later = (log.time > fill[1] + VENT - LEVEL) & (log.time < fill[1] + VENT)
-        left = _mean(log.measured[later])[sensor] - levels[sensor]
+        left = _change(log.time, pressure, (start, end + VENT))
         if left > STAYS * rise:
             problems.append(f"it does not vent: {left:.0f} Pa are left after {VENT:.0f} s")
         if sensor_sure < 1.0 - CLEAR:
@@ -316,7 +315,7 @@ def _judge(log: RigLog, valve: int, fill: tuple[float, float], bends: Array) -> 
     elif sensor is None:
         problems.append("motion but no pressure: look at its sensor")
     sure = max(0.0, min(sensor_sure, bend_sure))
-    lags = (answered - fill[0] if sensor is not None else float("nan"), moved - answered)
+    lags = (answered - start, moved - answered)
     side = 1 if bend >= 0.0 else -1
     return ValveFinding(valve, sensor, segment, side, rise, bend, sure, *lags, tuple(problems))
 
@@ -328,7 +327,7 @@ def _largest(changes: Array, least: float) -> tuple[int | None, float, float]:
     best = int(order[0])
     if sizes[best] < least:
         return None, float(changes[best]), 0.0
-    second = sizes[order[1]] if len(order) > 1 else 0.0
+    second = sizes[order[1:2]].sum()
     return best, float(changes[best]), float(1.0 - second / sizes[best])
 
 

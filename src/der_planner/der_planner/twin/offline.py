@@ -70,7 +70,8 @@ class OfflineTwin:
         wiring: Wiring | None = None,
     ) -> None:
         self._wiring = wiring
-        self.pneumatics = BoardPneumatics(segment_count=segment_count, seed=seed)
+        hoses = [abs(chamber) - 1 for chamber in wiring.chambers] if wiring else None
+        self.pneumatics = BoardPneumatics(segment_count, seed, hoses)
         atmosphere = self.pneumatics.atmosphere
         self.twin = LimbTwin(seed, run, atmosphere=atmosphere, gravity=gravity, masses=masses)
         if self.twin.segment_count != segment_count:

@@ -21,6 +21,7 @@ from pressure_driver.emulator.firmware import BOARDS
 from pressure_driver.emulator.pneumatics import BoardPneumatics
 from pressure_driver.emulator.runner import BoardRunner, emulated_line
 from pressure_driver.node import read_settings
+from pressure_driver.orders import order_of
 from pressure_driver.settings import EmulatorSettings
 
 
@@ -31,8 +32,10 @@ class BoardEmulator(Node):
         super().__init__("board_emulator", namespace=topics.NAMESPACE)
         self.fatal_error = ""
         settings = read_settings(self, EmulatorSettings)
-        pneumatics = BoardPneumatics(settings.segment_count, settings.seed)
-        protocol = BOARDS[settings.protocol](2 * settings.segment_count)
+        count = 2 * settings.segment_count
+        hoses = order_of(settings.wiring, count)
+        pneumatics = BoardPneumatics(settings.segment_count, settings.seed, hoses)
+        protocol = BOARDS[settings.protocol](count)
         protocol.configure(settings)
         self._board = EmulatedBoard(protocol, pneumatics, settings.seed)
         faults = self._parse(settings.faults)  # before the port stands where others see it

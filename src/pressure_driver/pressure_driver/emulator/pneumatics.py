@@ -2,13 +2,16 @@
 
 Each chamber has a proportional regulator. Filling is limited by the inlet valve (a ramp), venting
 by the outlet orifice (slower the less pressure is left, reaching zero in finite time), and a
-chamber feels what its neighbour in the pair does, since they share a wall and a manifold. The
-numbers agree with logs of a real limb: 9 kPa/s filling, 2.5 s from 90 to 10 % when a step of 7 kPa
-is vented, a neighbour that rises by up to a quarter of the change and is back after about a second.
+chamber feels what its neighbour in the limb does, since they share a wall. The numbers agree with
+logs of a real limb: 9 kPa/s filling, 2.5 s from 90 to 10 % when a step of 7 kPa is vented, a
+neighbour that rises by up to a quarter of the change and is back after about a second. The limb
+does this and not the board: the chambers of the other segment stay as they are, and the neighbour
+falls below the room's pressure while the chamber is vented.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TypeAlias
 
 import numpy as np
@@ -56,9 +59,12 @@ class BoardPneumatics:
     Args:
         segment_count: M, number of segments; there are 2M chambers.
         seed: of the drawn variations.
+        chambers: (2M,) chamber of the limb that each valve fills, counted from 0; None: its own.
     """
 
-    def __init__(self, segment_count: int = 2, seed: int = 0) -> None:
+    def __init__(
+        self, segment_count: int = 2, seed: int = 0, chambers: Sequence[int] | None = None
+    ) -> None:
         self.chamber_count = 2 * segment_count
         generator = np.random.default_rng([seed, 0x9A1B])
         self.atmosphere = float(101_325.0 + generator.uniform(-700.0, 1500.0))
@@ -85,7 +91,9 @@ class BoardPneumatics:
         self._vent_coupling = vary(VENT_COUPLING)
         self._coupling_time = vary(COUPLING_TIME)
         self._dead_time = float(DEAD_TIME * generator.uniform(0.7, 1.3))
-        self._neighbour = np.arange(self.chamber_count).reshape(-1, 2)[:, ::-1].ravel()
+        filled = np.arange(self.chamber_count) if chambers is None else np.array(chambers)
+        # Chambers 2k and 2k + 1 are neighbours, whatever valves fill them.
+        self._neighbour = np.argsort(filled)[filled ^ 1]
 
         self._gauge = np.zeros(self.chamber_count)
         self._disturbance = np.zeros(self.chamber_count)

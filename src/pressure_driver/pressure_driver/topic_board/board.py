@@ -8,8 +8,8 @@ from dataclasses import replace
 
 from pressure_driver.emulator.device import BoardReading
 from pressure_driver.emulator.firmware import NativeBoard
-from pressure_driver.following import valves_of
-from pressure_driver.settings import SettingError, TopicBoardSettings
+from pressure_driver.orders import order_of
+from pressure_driver.settings import TopicBoardSettings
 
 STALE = 0.2
 """[s] after which readings are not told any more."""
@@ -29,13 +29,7 @@ class Scale:
 
     def __init__(self, settings: TopicBoardSettings) -> None:
         count = 2 * settings.segment_count
-        try:
-            self._order = valves_of(settings.order, count, first=0)
-        except ValueError as error:
-            raise SettingError(
-                f"parameter 'order' is '{settings.order}': name each of the chambers 0 to "
-                f"{count - 1} once, as in '0,1,2,3'"
-            ) from error
+        self._order = order_of(settings.order, count, first=0, name="order")
         self._scale, self._offset = settings.scale, settings.offset
         self._room = settings.atmosphere if settings.absolute else 0.0
 
