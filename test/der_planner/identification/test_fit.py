@@ -170,7 +170,7 @@ def test_bad_logs_are_refused_by_what_is_wrong(log):
         "swapped": replace(log, bend_angles=q[:, ::-1]),
         "wrong way": replace(log, bend_angles=-q),
         "follow its command": replace(log, commanded_differential=u[::-1].copy()),
-        "units": replace(log, measured_differential=u * 1e-4),
+        "pressure_unit": replace(log, measured_differential=u * 1e-4),
     }
     for match, bad in cases.items():
         with pytest.raises(LogError, match=match):

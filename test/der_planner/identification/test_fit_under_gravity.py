@@ -56,7 +56,7 @@ def test_a_chain_held_sideways_that_swings_and_carries_a_mass_is_fitted():
     # the stiffness and a rest angle that was off by 12°.
     first, known = limb.segments[0], report.value("log_stiffness[0]")
     truth = 0.122 / np.sum(1.0 / chain._stiffness[:7])
-    assert known.deviation < 0.06
+    assert known.deviation < 0.08
     assert first.bending_stiffness == pytest.approx(truth, rel=0.12)
     assert f"{np.exp(known.value):.3f} × the prior's" in report.text()
     rest = first.rest_curvature * first.length

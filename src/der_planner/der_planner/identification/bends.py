@@ -66,7 +66,7 @@ SHAKES = 0.5
 """The same rate from which on a limb swings so much that what its friction held lets go [rad/s]."""
 SHAKEN = 4.0
 """Time for which that is so afterwards [s]."""
-SHAKEN_WORSE = 4.0
+SHAKEN_WORSE = 8.0
 """Slow errors then over those elsewhere, at least."""
 SOFTNESS = 3.0
 """Errors beyond this multiple of the usual one count less than their square."""
@@ -387,7 +387,8 @@ class BendFit:
             by = _apart(part.angles_by[rows])
             usual = np.repeat(self.errors[:2, None], rows.sum(), axis=1)
             usual[1, ~on[rows]] = self.errors[0]  # elsewhere fast errors count as slow ones do
-            usual[:, shaken[rows] & ~on[rows]] = self.errors[2]
+            usual[0, shaken[rows]] = self.errors[2]
+            usual[1, shaken[rows] & ~on[rows]] = self.errors[2]
             for error, change, weight in zip(left, by, 1.0 / (usual * scale), strict=True):
                 errors.append((weight * error).ravel())
                 slopes.append((weight[..., None] * change).reshape(-1, len(values)))
