@@ -199,11 +199,11 @@ class Options:
         Raises:
             PlanningError: numbers of a motion, or a path that is out of reach.
         """
-        rod = RodModel(limb)
+        rod = None if self.calibrate else RodModel(limb)
         for name, model in {(trial.motion, trial.model) for trial in trials}:
             motion = self.motion(name)
-            if not self.calibrate:
-                followed(motion, rod, Model.of(limb, model), None)
+            if rod is not None:
+                followed(motion, rod, rod if model == "der" else Model.of(limb, model), None)
             elif motion.path is not None:  # what a limb reaches is known once it is calibrated
                 motion.path.check_unit(limb.length)
 

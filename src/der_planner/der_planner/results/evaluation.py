@@ -39,6 +39,8 @@ LEAST_VALID = 0.9
 """Least share of valid images of such a run."""
 DRAWN = "drawn_path_m"
 """Key of the drawn points, of a run along the nearest path to them."""
+NEAREST = ", nearest path"
+"""Ends the name of such a run's motion."""
 REFERENCE_POINTS = 25
 LARGEST_AHEAD = 1e-3
 """Stamps may be this far [s] from the future in such a run."""
@@ -134,7 +136,7 @@ def evaluate_run(run: RunSeries, settings: EvaluationSettings | None = None) -> 
     about = run.description
     valid = len(series.time) / max(1, len(images))
     return RunResult(
-        motion=f"{about.motion}, nearest path" if DRAWN in about.extra else about.motion,
+        motion=about.motion + (NEAREST if DRAWN in about.extra else ""),
         model=about.model,
         method=about.method,
         trial=about.trial,

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import TypeVar
 
-from der_planner.results.evaluation import RunResult
+from der_planner.results.evaluation import NEAREST, RunResult
 from der_planner.results.statistics import Comparison, Summary
 
 CASE = {
@@ -164,7 +164,7 @@ def format_table(rows: Sequence[Summary], comparisons: Sequence[Comparison] = ()
 def nearest_note(rows: Sequence[Summary]) -> list[str]:
     """Return a sentence on what errors count from, where a path was drawn that is out of reach."""
     said = "nearest path: the reference is the nearest path in reach, not the drawn one (grey dots)"
-    return [said] if any(row.motion.endswith(", nearest path") for row in rows) else []
+    return [said] if any(row.motion.endswith(NEAREST) for row in rows) else []
 
 
 def format_comparison(comparison: Comparison) -> str:
