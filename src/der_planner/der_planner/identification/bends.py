@@ -275,15 +275,14 @@ def predicted(free: FreeTerms, model: Model, log: Prepared, values: Array) -> Pr
     # The tangent of the arcs takes longer than all their differences: only where it is needed.
     response = follow(model.another(limb), log, linearise=any(driven))
     angles, tip = response.bend_angles, response.tip
-    moments, gain = _moments(limb, log, angles), _gain(limb)
     angles_by, tip_by = (np.empty((*part.shape, len(values))) for part in (angles, tip))
-    for place, (unit, nudged) in enumerate(zip(units, limbs, strict=True)):
-        if driven[place]:
-            assert response.derivative is not None
-            change = (_moments(nudged, log, angles) - moments) / gain / (_NUDGE * scale[place])
-            tip_by[:, :, place], angles_by[:, :, place] = response.derivative.by_effective(change)
-            continue
-        moved = follow(model.another(free.limb_with(values + _STEP * unit)), log)
+    if response.derivative is not None:
+        moments = [_moments(nudged, log, angles) for nudged in compress(limbs, driven)]
+        change = np.stack(moments, axis=2) - _moments(limb, log, angles)[..., None]
+        change /= _gain(limb)[:, None] * _NUDGE * scale[driven]
+        tip_by[:, :, driven], angles_by[:, :, driven] = response.derivative.by_effective(change)
+    for place in np.flatnonzero(np.logical_not(driven)):
+        moved = follow(model.another(free.limb_with(values + _STEP * units[place])), log)
         tip_by[:, :, place] = (moved.tip - tip) / (_STEP * scale[place])
         angles_by[:, :, place] = (moved.bend_angles - angles) / (_STEP * scale[place])
     return Predicted(angles, tip, angles_by, tip_by)

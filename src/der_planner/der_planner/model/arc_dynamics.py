@@ -47,7 +47,7 @@ class Arcs(NamedTuple):
     viscous: Vector  # (n,) Kelvin-Voigt time [s]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def joints(q: Vector, arcs: Arcs) -> Complex:
     """Return (3, n + 1): where each segment starts, its first heading, and where it ends."""
     n = q.size
@@ -63,7 +63,7 @@ def joints(q: Vector, arcs: Arcs) -> Complex:
     return result
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def point_derivatives(
     q: Vector, arcs: Arcs, frame: Complex, p: int, slopes: Complex, J: Complex, H: Complex
 ) -> Any:
@@ -94,7 +94,7 @@ def point_derivatives(
     return point
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def arc_slopes(q: Vector, arcs: Arcs, frame: Complex, order: int) -> Complex:
     """Return exp(iΦ_i) L_i times the derivatives 1 … order (2 or 3) of g at each bend angle."""
     n = q.size
@@ -141,7 +141,7 @@ def inertia(q: Vector, v: Vector, arcs: Arcs) -> tuple[Vector, Vector, Vector, V
     return M, C, D, torque
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def acceleration(q: Vector, v: Vector, torque: Vector, arcs: Arcs) -> Vector:
     """Return q̈ from M q̈ + C q̇ + D q̇ + K(q) = torque + gravity's torque, all (n,).
 

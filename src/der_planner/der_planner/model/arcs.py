@@ -54,16 +54,16 @@ class ArcFirstOrder:
     def tangent(self, effective: Array, start: Array | None = None) -> tuple[Array, Array]:
         """Return the changes of tip and bend angles, see `FirstOrder.tangent`."""
         count, steps, size, n = self.by_pressure.shape
-        x = np.zeros(size)
+        x = np.zeros((size, *effective.shape[3:]))
         if start is not None:
             x[:n] = start
-        moved = np.empty((count + 1, n))
+        moved = np.empty((count + 1, n, *effective.shape[3:]))
         moved[0] = x[:n]
         for k in range(count):
             for s in range(steps):
                 x = self.by_state[k, s] @ x + self.by_pressure[k, s] @ effective[k, s]
             moved[k + 1] = x[:n]
-        return np.einsum("kan,kn->ka", self.tip_by_angle, moved), moved
+        return np.einsum("kan,kn...->ka...", self.tip_by_angle, moved), moved
 
     def sensitivity(self, pulse: Array | None = None) -> Array:
         """Return ∂tip/∂input, see `FirstOrder.sensitivity`."""

@@ -65,12 +65,12 @@ def bend_change(rod: Rod, q: Array, moved: Array) -> Array:
     Args:
         rod: of the configurations.
         q: (K, 4N-1).
-        moved: (K, 4M) change of the coordinates `bend_outputs`.
+        moved: (K, 4M) change of the coordinates `bend_outputs`, or (K, 4M, C) changes.
     """
     columns = []
     for place, (a, b) in enumerate(end_edges(rod)):
-        x1, y1, x2, y2 = moved[:, 4 * place : 4 * place + 4].T
-        dx, dy, square = _edge(q, a, b)
+        x1, y1, x2, y2 = np.moveaxis(moved[:, 4 * place : 4 * place + 4], 1, 0)
+        dx, dy, square = (part.reshape(-1, *np.ones_like(x1.shape[1:])) for part in _edge(q, a, b))
         columns.append((dx * (y2 - y1) - dy * (x2 - x1)) / square)
     relative: Array = np.diff(np.stack(columns, axis=1), axis=1, prepend=0.0)
     return relative

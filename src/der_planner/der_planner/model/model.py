@@ -47,7 +47,8 @@ class FirstOrder(Protocol):
         """Return the changes of tip (K+1, 2) [m] and bend angles (K+1, M) [rad].
 
         Args:
-            effective: (K, S, M) change of the effective pressures [Pa].
+            effective: (K, S, M) change of the effective pressures [Pa], or (K, S, M, C) changes,
+                which give (K+1, 2, C) and (K+1, M, C).
             start: change of the pose at the beginning, as `Model.rest_slope` times pressures gives
                 it; None: none.
         """

@@ -256,8 +256,7 @@ class Poses:
         q = np.array([state.q for state in self.states])
         slope = np.zeros((*q.shape, rod.segment_count))
         slope[:, rod.free] = self.tangents
-        outputs = np.moveaxis(slope[:, bend_outputs(rod)], 2, 0)
-        bend = np.stack([bend_change(rod, q, moved) for moved in outputs], axis=2)
+        bend = bend_change(rod, q, slope[:, bend_outputs(rod)])
         tip = slope[:, [-3, -2]]
         found = np.linalg.solve(np.swapaxes(bend, 1, 2), np.swapaxes(tip, 1, 2))
         return np.asarray(np.swapaxes(found, 1, 2), dtype=np.float64)

@@ -81,7 +81,7 @@ class Derivative:
         return self._bent(*self._felt(np.asarray(change, dtype=float)))
 
     def by_effective(self, change: Array) -> tuple[Array, Array]:
-        """Return the same for changes (n+1, M) of the effective pressures at the boundaries [Pa].
+        """Return the same for C changes (n+1, M, C) of the effective pressures at boundaries [Pa].
 
         Each interval changes by the mean of both ends, the start by the first row.
         """
@@ -279,9 +279,9 @@ def step_middles(count: int, steps: int, period: float = CONTROL_PERIOD) -> Arra
 
 
 def means_between(pressure: Array, steps: int) -> Array:
-    """Return (K − 1, S, M) means of the pressures (K, M) at both ends of each interval."""
+    """Return (K − 1, S, M, …) means of the pressures (K, M, …) at both ends of each interval."""
     middle = 0.5 * (pressure[1:] + pressure[:-1])
-    return np.repeat(middle[:, None, :], steps, axis=1)
+    return np.repeat(middle[:, None], steps, axis=1)
 
 
 # Window by window along a known bend -----------------------------------------------------------

@@ -83,21 +83,24 @@ class Linearisation:
         """Return the change of the outputs (K+1, P) for a change of the pressures.
 
         Args:
-            pressures: (K, M) held over the steps of an interval, or (K, S, M) [Pa].
-            start: change of q[free] and v[free] at the beginning, each (F,).
+            pressures: (K, M) held over the steps of an interval, or (K, S, M) [Pa]; or C changes
+                at once, which takes less time, (K, S, M, C) for outputs (K+1, P, C).
+            start: change of q[free] and v[free] at the beginning, each (F,) or (F, C).
         """
-        change = by_step(pressures, self.steps, self.input_count)
-        require(len(change) == self.intervals, "pressures", f"{self.intervals} rows", len(change))
-        out = np.empty((self.intervals + 1, len(self.outputs)))
-        step_kernel.tangent(change, self._initial(start), self._chain, out)
-        return out
-
-    def _initial(self, start: tuple[ArrayLike, ArrayLike] | None) -> Array:
-        initial = np.zeros((2, len(self._chain.mass)))
+        given = np.asarray(pressures, dtype=float)
+        if alone := given.ndim < 4:
+            given = by_step(given, self.steps, self.input_count)[..., None]
+        shape, columns = (self.intervals, self.steps, self.input_count), given.shape[3]
+        change = array(given, (*shape, columns), "pressures")
+        initial = np.zeros((2, len(self._chain.mass), columns))
         if start is not None:
+            rows = (len(self._state_rows),) if alone else (len(self._state_rows), columns)
             for row, value in enumerate(start):
-                initial[row, self._state_rows] = array(value, self._state_rows.shape, "start")
-        return initial
+                found = array(value, rows, "start")
+                initial[row, self._state_rows] = found[:, None] if alone else found
+        out = np.empty((self.intervals + 1, len(self.outputs), columns))
+        step_kernel.tangent(change, initial, self._chain, out)
+        return out[..., 0] if alone else out
 
     def sensitivity(self, pulse: ArrayLike | None = None) -> Array:
         """Return ∂output/∂input (K+1, P, K, M) [m/Pa], zero where the input comes later.

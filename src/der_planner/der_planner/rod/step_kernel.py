@@ -167,9 +167,10 @@ def advance(solve: int, dq: Array, dv: Array, y: Array, before: Array, chain: So
 
 @kernel
 def put_outputs(dq: Array, outputs: Array, out: Array) -> None:
-    """Write the outputs of the first column of dq into out (P,)."""
+    """Write the outputs of dq (n, C) into out (P, C)."""
     for p in range(outputs.shape[0]):
-        out[p] = dq[outputs[p], 0]
+        for c in range(dq.shape[1]):
+            out[p, c] = dq[outputs[p], c]
 
 
 @kernel
@@ -182,24 +183,23 @@ def ends_interval(solve: int, steps: int, chain: SolveChain) -> bool:
 
 @allocating_kernel
 def tangent(change: Array, start: Array, chain: SolveChain, out: Array) -> None:
-    """Fill out (K+1, P) with the change of the outputs for a change (K, S, M) of the inputs.
+    """Fill out (K+1, P, C) with changes of the outputs for changes (K, S, M, C) of the inputs.
 
-    start (2, n) is the change of the initial q and v.
+    start (2, n, C) are the changes of the initial q and v.
     """
-    _, steps, count = change.shape
+    _, steps, count, columns = change.shape
     size = start.shape[1]
-    dq = start[0].copy().reshape(size, 1)
-    dv = start[1].copy().reshape(size, 1)
-    y = np.zeros((size, 1))
-    before = np.zeros((size, 1))
+    dq, dv = start[0].copy(), start[1].copy()
+    y, before = np.zeros((size, columns)), np.zeros((size, columns))
     put_outputs(dq, chain.outputs, out[0])
     for s in range(chain.steps.shape[0]):
         k, step = chain.steps[s] // steps, chain.steps[s] % steps
         for i in range(size):
-            total = 0.0
-            for m in range(count):
-                total += chain.record.inputs[s, i, m] * change[k, step, m]
-            y[i, 0] = total
+            for c in range(columns):
+                total = 0.0
+                for m in range(count):
+                    total += chain.record.inputs[s, i, m] * change[k, step, m, c]
+                y[i, c] = total
         advance(s, dq, dv, y, before, chain)
         if ends_interval(s, steps, chain):
             put_outputs(dq, chain.outputs, out[k + 1])
