@@ -24,7 +24,7 @@ def model():
 def calibrated() -> FreeLevel:
     """Return the free level of a limb that is well known."""
     free = FreeLevel(LIMB)
-    still = Lacking(0.0, np.zeros(2), np.zeros(2), np.zeros(4), 1e-12 * np.eye(4))
+    still = Lacking(0.0, *np.zeros((3, 2)), np.zeros(4), 1e-12 * np.eye(4))
     for k in range(4000):
         away = DEVIATION * (-1) ** k
         felt = replace(still, effective=np.array([k % 7, k % 5]) * 1e3, value=away)
@@ -45,7 +45,12 @@ def lacking(model, forces, pressure=(6000.0, 3000.0)) -> Lacking:
     even = model.kinematics
     offset = (pushed.q - free.q)[-3:-1] - (even.tip(bend) - even.tip(before))
     return Lacking(
-        1.0, bend, pressures, np.concatenate([missing, offset]), np.diag((DEVIATION / 4) ** 2)
+        1.0,
+        bend,
+        pressures,
+        np.zeros(2),
+        np.concatenate([missing, offset]),
+        np.diag((DEVIATION / 4) ** 2),
     )
 
 
@@ -158,11 +163,26 @@ def test_a_payload_is_weighed_and_contact_that_grows_is_not():
     assert grown[-1].payload == 0.0
 
 
+def test_friction_that_is_larger_and_less_even_than_said_is_no_touch():
+    segments = [
+        replace(s, friction_moment=900.0 * s.moment_gain, friction_curvature=0.8)
+        for s in LIMB.segments
+    ]
+    sense = TouchSense(RodModel(replace(LIMB, segments=tuple(segments))))
+    still = Lacking(0.0, *np.zeros((3, 2)), np.zeros(4), np.diag((DEVIATION / 4) ** 2))
+    for k in range(900):
+        turned = np.clip(3.0 * np.sin(0.03 * k + np.array([0.0, 1.0])), -1.0, 1.0)
+        value = np.concatenate([-450.0 * turned, [1.2e-3 * turned[0], 8e-4 * turned[1]]])
+        found = sense.look(replace(still, time=k / 30, friction=turned, value=value))
+        assert not found.touched
+    assert sense.look(replace(still, time=30.0, value=np.array([900.0, 0.0, 0.0, 0.0]))).touched
+
+
 @pytest.mark.slow
 def test_noise_is_taken_for_a_touch_about_once_in_an_hour(model):
     draw = np.random.default_rng(8)
     sense, spread = TouchSense(model), np.array([700.0, 300.0, 2e-3, 1e-3])
-    still = Lacking(0.0, np.zeros(2), np.zeros(2), np.zeros(4), 1e-6 * np.diag(spread**2))
+    still = Lacking(0.0, *np.zeros((3, 2)), np.zeros(4), 1e-6 * np.diag(spread**2))
     for k in range(400):
         value = 0.5 * spread * draw.standard_normal(4)
         sense.look(replace(still, time=0.3 * k, value=value))

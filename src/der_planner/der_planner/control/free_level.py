@@ -1,10 +1,11 @@
 """What the model lacks of a limb that nothing touches, by the estimator: the free level.
 
 Gains, friction and the camera are a little wrong. What is lacking (`Lacking.value`) is then
-c + γ·w + κ·θ + e and some noise, with the pressures w of all segments, their bend angles θ where
-gravity bends the limb as well, and an e that wanders and is forgotten. It is less known where
-friction turns round or the limb hardly moves: what sticks takes any pressure up to its friction. c,
-γ, κ, e and noise are learned while nothing is touched.
+c + γ·w + κ·θ + φ·z + e and some noise, with the pressures w of all segments, their bend angles θ
+where gravity bends the limb as well, the share z of its friction that a segment has taken up, and
+an e that wanders and is forgotten. It is less known where friction turns round or the limb hardly
+moves: what sticks takes any pressure up to its friction. c, γ, κ, φ, e and noise are learned while
+nothing is touched.
 """
 
 from __future__ import annotations
@@ -26,6 +27,11 @@ _FREE_GAIN, _FREE_COUPLING, _FREE_TIP = 0.15, 0.05, 1e-7
 """The same of γ by a segment's own pressure and by that of another, and of the tip [m/Pa]."""
 _FREE_STIFFNESS, _FREE_TIP_BENT = 0.25, 1e-3
 """The same of κ, over the segment's stiffness, and of the tip [m/rad]."""
+_FREE_FRICTION = 0.5
+"""The same of φ, over the largest friction that the model knows."""
+_RUBS_UNEVENLY = 0.2
+"""How far friction that is uneven along a segment moves the tip, over how far it bends the segment
+times its length."""
 _WANDERS = 0.5
 """Share of e in its variance and the noise's."""
 _FORGOTTEN = 1.5
@@ -52,6 +58,7 @@ class Lacking:
         time: [s].
         bend_angles: (M,) [rad].
         effective: (M,) pressure w of the model [Pa].
+        friction: (M,) z, −1 … 1.
         value: (M + 2,) pressure that the model lacks [Pa], and the tip's displacement that the
             bend angles do not explain [m].
         covariance: of value, with what friction may differ from its model.
@@ -60,18 +67,18 @@ class Lacking:
     time: float
     bend_angles: Array
     effective: Array
+    friction: Array
     value: Array
     covariance: Array
 
     @staticmethod
-    def of(time: float, nominal: Nominal, known: Knowledge, friction: Array) -> Lacking:
+    def of(time: float, nominal: Nominal, known: Knowledge) -> Lacking:
         """Return what the estimator says that the model lacks.
 
         Args:
             time: [s].
             nominal: the model's motion.
             known: the filter's state then.
-            friction: (M,) the largest that the model knows [Pa].
         """
         bend, rate, _ = nominal.at(time)
         inputs, rate = len(bend), rate + known.parts[1]
@@ -82,12 +89,26 @@ class Lacking:
         spread = rows @ known.covariance @ rows.T
         turning = _FRICTION_SLIDING + 1.0 - known.memory.friction**2
         turning = np.minimum(1.0, turning + 1.0 / (1.0 + (rate / _STICKS) ** 2))
-        spread[:inputs, :inputs] += np.diag((_FRICTION_WRONG * friction) ** 2 * turning)
-        return Lacking(time, bend + known.parts[0], known.effective, rows @ known.mean, spread)
+        pressure, uneven = _friction(nominal.model.limb)
+        spread[:inputs, :inputs] += np.diag((_FRICTION_WRONG * pressure) ** 2 * turning)
+        spread[inputs:, inputs:] += (uneven**2 @ turning) * np.eye(2)
+        bent, turned = bend + known.parts[0], known.memory.friction
+        return Lacking(time, bent, known.effective, turned, rows @ known.mean, spread)
+
+    def by(self, kept: float) -> Array:
+        """Return what c, γ, κ, φ and e are multiplied by, with the share of e that is left."""
+        return np.concatenate([[1.0], self.effective, self.bend_angles, self.friction, [kept]])
+
+
+def _friction(limb: Limb) -> tuple[Array, Array]:
+    """Return the largest friction of the segments (M,) [Pa], and how far it moves the tip [m]."""
+    pressure = np.array([s.friction_moment / s.moment_gain for s in limb.segments])
+    lengths = np.array([s.length for s in limb.segments])
+    return pressure, _RUBS_UNEVENLY * pressure * limb.static_gain * lengths
 
 
 class FreeLevel:
-    """What the model lacks of a limb that nothing touches: c + γ·w + κ·θ + e, and noise.
+    """What the model lacks of a limb that nothing touches: c + γ·w + κ·θ + φ·z + e, and noise.
 
     Args:
         limb: of M segments.
@@ -107,7 +128,9 @@ class FreeLevel:
         if limb.weighs_in_plane:
             stiffness = [s.bending_stiffness / s.length / s.moment_gain for s in limb.segments]
             bent[:inputs], bent[inputs:] = _FREE_STIFFNESS * np.diag(stiffness), _FREE_TIP_BENT
-        known = np.column_stack([level, slope, bent, np.zeros(len(level))])
+        friction, uneven = _friction(limb)
+        rubs = np.vstack([_FREE_FRICTION * np.diag(friction), uneven, uneven])
+        known = np.column_stack([level, slope, bent, rubs, np.zeros(len(level))])
         self._mean = np.zeros_like(known)
         self._covariance = known[:, :, None] ** 2 * np.eye(known.shape[1])
         self.noise = noise**2
@@ -122,7 +145,7 @@ class FreeLevel:
             ahead: time since something was learned [s].
         """
         kept = np.exp(-ahead / _FORGOTTEN)
-        by = np.concatenate([[1.0], lacking.effective, lacking.bend_angles, [kept]])
+        by = lacking.by(kept)
         left = _WANDERS * (1.0 - kept**2) + 1.0 - _WANDERS
         return self._mean @ by, by @ self._covariance @ by + left * self.noise
 
@@ -140,7 +163,7 @@ class FreeLevel:
         self._covariance[:, -1] *= kept
         self._covariance[:, :, -1] *= kept
         self._covariance[:, -1, -1] += _WANDERS * (1.0 - kept**2) * self.noise
-        by = np.concatenate([[1.0], lacking.effective, lacking.bend_angles, [1.0]])
+        by = lacking.by(1.0)
         other = np.diag(lacking.covariance)
         seen = self._covariance @ by
         white = (1.0 - _WANDERS) * self.noise

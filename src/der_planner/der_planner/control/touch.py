@@ -153,9 +153,7 @@ class TouchSense:
             nominal: the model's motion.
             known: the filter's state then.
         """
-        segments = self._model.limb.segments
-        friction = np.array([s.friction_moment / s.moment_gain for s in segments])
-        return self.look(Lacking.of(time, nominal, known, friction))
+        return self.look(Lacking.of(time, nominal, known))
 
     def look(self, lacking: Lacking) -> Touch:
         """Return what a newer instant says of a touch."""
