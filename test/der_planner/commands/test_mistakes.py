@@ -40,6 +40,7 @@ def call(monkeypatch, capsys, tmp_path):
     ("module", "arguments", "code", "words"),
     [
         ("der_planner.commands.evaluate", ["b", "--report", "BUSY"], 2, "cannot be made"),
+        ("der_planner.commands.evaluate", ["b", "--contact"], 2, "--limb FILE or --plan FILE"),
         ("der_planner.commands.calibrate_limb", ["--offline", "--out", "BUSY"], 2, "no folder"),
         ("der_planner.commands.calibrate_limb", ["--offline", "--out", "."], 2, "is a folder"),
         ("der_planner.commands.calibrate_limb", ["--excitation", "BUSY"], 2, "no folder"),

@@ -130,10 +130,10 @@ class BagOfRun:
             differential_pressure=np.asarray(value, dtype=float),
         )
 
-    def state(self, seconds: float, tip, valid=True, topic="/limb/state") -> None:
+    def state(self, seconds: float, tip, valid=True, topic="/limb/state", bend=(0.1, 0.2)) -> None:
         x, y = tip if valid else (np.nan, np.nan)
         point = self.make("geometry_msgs/msg/Point", x=float(x), y=float(y))
-        angles = np.array([0.1, 0.2])
+        angles = np.asarray(bend, dtype=float)
         self.write(topic, "LimbState", seconds, valid=valid, tip=point, bend_angle=angles)
 
     def pressure(self, seconds: float, commanded, measured, mode=2, faults=()) -> None:

@@ -6,7 +6,11 @@ import sys
 from pathlib import Path
 
 import pytest
+from link_chain import LinkChain
 from runs import BagOfRun
+
+from der_planner.limb import Limb
+from der_planner.planning import Motion, plan
 
 pytestmark = pytest.mark.slow
 
@@ -50,3 +54,24 @@ def test_recover_says_what_it_did(experiment: Path):
     assert f"saved in {bag}_recovered; lost: " in done.stdout
     assert "whole, nothing to recover" in done.stdout
     assert "missing" in done.stderr
+
+
+def test_what_touched_a_recorded_limb_is_told(tmp_path: Path):
+    planned, chain = plan(Limb.default(), Motion.named("same_direction", 0.3, 6.0, 1)), LinkChain(3)
+    planned.limb.to_yaml(tmp_path / "limb.yaml")
+    bag = BagOfRun(tmp_path / "bag", run=json.dumps({"trial": 1, "seed": 1}))
+    names = ("differential_pressure", "tip_reference", "tip_predicted")
+    arrays = {name: getattr(planned, name).ravel() for name in names}
+    bag.plan(time=planned.time, amplitude=0.3, period=6.0, cycles=1, **arrays)
+    for index, command in enumerate(planned.differential_pressure):
+        when = float(planned.time[index])
+        chain.push(0.244, (0.0, 0.5 if when > 5.0 else 0.0))
+        seen = chain.seen()
+        bag.setpoint(index, command)
+        bag.pressure(when, command, seen.differential_pressure)
+        bag.state(when, seen.tip, bend=seen.bend_angles)
+        chain.advance(command, 0.05)
+    bag.bag.close()
+    done = run("evaluate.py", tmp_path / "bag", "--contact", "--limb", tmp_path / "limb.yaml")
+    assert done.returncode == 0, done.stderr
+    assert "touched from 5." in done.stdout

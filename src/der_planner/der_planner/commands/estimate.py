@@ -5,8 +5,7 @@
 Any bag of a plan will do, played with feedback or without. The estimator of feedback goes over all
 pictures and pressures of the run, forward and backward. The table (CSV) has a row every 50 ms: bend
 angles and rates, tip, and per segment the effective pressure that the model lacks and the relative
-error of its gain, each with its standard deviation. `--contact` tells what touched the limb: when,
-where and with what force. Exit code 0: written; 2: a file cannot be used.
+error of its gain, each with its standard deviation. Exit code 0: written; 2: a file cannot be used.
 """
 
 from __future__ import annotations
@@ -19,8 +18,7 @@ import numpy as np
 
 from der_planner.arrays import Array
 from der_planner.commands.learn import FAILURES, add_plan_options, check_same, plan_of
-from der_planner.control.hindsight import Filmed, Smoothed, smooth, touches
-from der_planner.control.touch import Touch
+from der_planner.control.hindsight import Filmed, Smoothed, smooth
 from der_planner.experiment.console import check_file, command_parser, run_command
 from der_planner.planning import Plan
 from der_planner.results import EvaluationError, RunSeries, load_run
@@ -31,8 +29,8 @@ def main() -> int:
     parser = command_parser(__doc__)
     parser.add_argument("bag", type=Path, metavar="BAG", help="of a run")
     parser.add_argument("--out", type=Path, metavar="FILE", help="table (CSV) to write")
-    parser.add_argument("--contact", action="store_true", help="tell what touched the limb")
     add_plan_options(parser)
+    parser.add_argument("--namespace", default="", help="of the limb, where a bag holds several")
     given = parser.parse_args()
     return run_command(lambda: _estimate(given), *FAILURES, code=2)
 
@@ -44,15 +42,13 @@ def _estimate(given: argparse.Namespace) -> int:
     planned = plan_of(run, given)
     smoothed = estimate_run(planned, run)
     print("\n".join(_said(smoothed, run)))
-    if given.contact:
-        print("\n".join(_touched(touches(*_filmed(planned, run)))))
     if given.out is not None:
         write_table(smoothed, given.out)
         print(given.out)
     return 0
 
 
-def _filmed(planned: Plan, run: RunSeries) -> tuple[Plan, Filmed]:
+def filmed(planned: Plan, run: RunSeries) -> tuple[Plan, Filmed]:
     """Return the plan as it was played, and what camera and board showed of the run."""
     check_same(planned, run)
     played = dataclasses.replace(planned, differential_pressure=run.setpoints.value)
@@ -73,7 +69,7 @@ def estimate_run(planned: Plan, run: RunSeries) -> Smoothed:
         EvaluationError: it holds no pictures or no measured pressures.
     """
     try:
-        return smooth(*_filmed(planned, run))
+        return smooth(*filmed(planned, run))
     except ValueError as error:
         raise EvaluationError(f"{run.description.title}: {error}") from error
 
@@ -96,15 +92,6 @@ def _said(smoothed: Smoothed, run: RunSeries) -> list[str]:
         told = smoothed.consistency(run.truth.time, run.truth.value)
         lines.append(f"true tip against the estimate: {told:.2f} of the variance")
     return lines
-
-
-def _touched(found: list[Touch]) -> list[str]:
-    """Return what touched the limb, a line each."""
-    lines = [
-        f"touched from {each.since:.2f} s on, surest at {each.time:.2f} s: {each.said}"
-        for each in found
-    ]
-    return lines or ["nothing touched the limb"]
 
 
 def write_table(smoothed: Smoothed, path: Path) -> None:

@@ -3,6 +3,7 @@
 python3 scripts/evaluate.py out/bags/*
 python3 scripts/evaluate.py out --report report           every bag of an experiment's folder
 python3 scripts/evaluate.py out/bags/same_direction_der_1 --video film.mp4
+python3 scripts/evaluate.py out/bags/same_direction_der_1 --contact --limb out/limbs/seed_3.yaml
 
 A bag of several limbs gives a row for each: every limb is evaluated within its own namespace.
 """
@@ -12,6 +13,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from der_planner.commands.estimate import filmed
+from der_planner.commands.learn import add_plan_options, plan_of
+from der_planner.control.hindsight import touches
 from der_planner.experiment.console import (
     Progress,
     check_file,
@@ -23,6 +27,7 @@ from der_planner.results import (
     BagError,
     EvaluationError,
     EvaluationSettings,
+    RunSeries,
     compare,
     evaluate_bags,
     format_table,
@@ -63,7 +68,16 @@ def _arguments() -> argparse.Namespace:
         action="store_true",
         help="estimate a constant lag of each run and take it out before computing E",
     )
-    return parser.parse_args()
+    parser.add_argument(
+        "--contact",
+        action="store_true",
+        help="tell what touched the limb of --limb or --plan: when, where, with what force",
+    )
+    add_plan_options(parser, needed=False)
+    given = parser.parse_args()
+    if given.contact != bool(given.limb or given.plan):
+        parser.error("--contact goes with --limb FILE or --plan FILE")
+    return given
 
 
 def expand(paths: list[Path]) -> list[Path]:
@@ -109,4 +123,18 @@ def _evaluate(given: argparse.Namespace) -> int:
         print(write_report(runs, results, given.report, progress=progress.say))
     if given.video is not None:
         print(write_video(runs[0], given.video))
+    for run in runs if given.contact else ():
+        print("\n".join([f"{run.description.title}:", *_touched(run, given)]))
     return 1 if any(entry.error for entry in found) else 0
+
+
+def _touched(run: RunSeries, given: argparse.Namespace) -> list[str]:
+    """Return what touched the limb in a run, a line each."""
+    try:
+        found = touches(*filmed(plan_of(run, given), run))
+    except ValueError as error:
+        raise EvaluationError(f"{run.description.title}: {error}") from error
+    return [
+        f"touched from {each.since:.2f} s on, surest at {each.time:.2f} s: {each.said}"
+        for each in found
+    ] or ["nothing touched the limb"]

@@ -38,6 +38,7 @@ def main() -> int:
     parser.add_argument("bags", nargs="+", type=Path, metavar="BAG", help="bags, oldest first")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the next plan")
     add_plan_options(parser)
+    parser.add_argument("--namespace", default="", help="of the limb, where a bag holds several")
     given = parser.parse_args()
     return run_command(lambda: _learn(given), *FAILURES, code=2)
 
@@ -100,12 +101,11 @@ def learning_summary(learner: Learner) -> dict[str, Any]:
 # The plan of a recorded run ----------------------------------------------------------------------
 
 
-def add_plan_options(parser: argparse.ArgumentParser) -> None:
-    """Add --limb or --plan, of which one is needed, and --namespace."""
-    base = parser.add_mutually_exclusive_group(required=True)
+def add_plan_options(parser: argparse.ArgumentParser, needed: bool = True) -> None:
+    """Add --limb or --plan, of which one may be needed."""
+    base = parser.add_mutually_exclusive_group(required=needed)
     base.add_argument("--limb", type=Path, metavar="FILE", help="limb file of the plan in the bag")
     base.add_argument("--plan", type=Path, metavar="FILE", help="learned plan that was played")
-    parser.add_argument("--namespace", default="", help="of the limb, where a bag holds several")
 
 
 def plan_of(run: RunSeries, given: argparse.Namespace) -> Plan:
