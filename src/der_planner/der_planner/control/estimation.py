@@ -178,10 +178,6 @@ class Estimator:
             age=time - self.newest,
         )
 
-    def missed(self, known: Knowledge, k: int) -> float:
-        """Return the distance of the tip from r̄ [m] at control period ``k``."""
-        return float(np.linalg.norm(self.gap(known, k)))
-
     def gap(self, known: Knowledge, k: int) -> Array:
         """Return the tip less r̄ (2,) [m] at control period ``k``."""
         nominal = self.nominal

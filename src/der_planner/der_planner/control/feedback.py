@@ -64,8 +64,7 @@ class Feedback:
         authority = _AUTHORITY * plan.limb.pneumatics.pressure_limit
         if reaction == "yield" and not plan.limb.calibrated.differential_pressure:
             reaction = "warn"
-        length = sum(segment.length for segment in plan.limb.segments)
-        self._supervisor = Supervisor(authority, length)
+        self._supervisor = Supervisor(authority)
         with _THREADS.limit(limits=1, user_api="blas"):
             self._nominal = Nominal(plan)
             self._chambers = ChamberLog(self._nominal)
@@ -174,8 +173,8 @@ class Feedback:
         else:
             supervisor.in_time()
         planned, before = self._nominal.command(k), self._chambers.sent(k - 1)
-        correction, swing, missed = np.zeros_like(planned), 0.0, 0.0
-        wanted = np.zeros_like(planned)
+        correction = wanted = np.zeros_like(planned)
+        swing = 0.0
         try:
             # Matrices of some ten rows: more threads only get into other processes' way.
             with _THREADS.limit(limits=1, user_api="blas"):
@@ -183,7 +182,6 @@ class Feedback:
                 self._feel()
                 age = instant - self._estimator.newest
                 swing = float(np.linalg.norm(known.parts[1]))
-                missed = self._estimator.missed(known, k)
                 share = supervisor.advance(instant, age, known.strange)
                 if share > 0.0:
                     wanted = share * self._horizon.solve(k, known)
@@ -201,9 +199,7 @@ class Feedback:
         self._reaction.follow(planned, self.touch, chambers)
         allowed = self._reaction.allowed(planned + self._reaction.corrected(correction))
         command: Array = within_limits(allowed[None], air, CONTROL_PERIOD, before)[0][0]
-        if self.touch.touched and self._reaction.acts:
-            missed = 0.0  # What is in the way keeps the tip away.
-        supervisor.sent(instant, command - planned, swing, missed)
+        supervisor.sent(instant, command - planned, swing)
         self._benefit.sent(k, command - planned, wanted)
         self._chambers.send(k, command)
         self._estimator.changed(instant)

@@ -1,14 +1,14 @@
 """Decides on the share of feedback's corrections that is sent.
 
 It goes from 0 to 1 once the limb is seen, and back to 0, which is the plan alone, where feedback
-can do harm: the camera sees nothing, or what it sees does not fit the model; corrections swing, or
-stay at what they are allowed, and the tip is far from its path; commands are asked for too late.
-Lost tags may come back; after the other reasons the rest of the run is played without feedback.
+can do harm: the camera sees nothing, or what it sees does not fit the model; corrections swing on
+and on; commands are asked for too late. Lost tags may come back; after the other reasons the rest
+of the run is played without feedback. Corrections that a limb does not follow lose their share by
+`der_planner.control.benefit`.
 """
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from dataclasses import dataclass
 
@@ -21,7 +21,6 @@ REASONS = {
     "tags lost": "the limb has not been seen for {:.1f} s",
     "inconsistent": "the limb moves as the model cannot, measurements are {:.0f} times too far off",
     "oscillation": "corrections swing by {:.0f} Pa, and neither they nor the limb come to rest",
-    "saturation": "a correction is at its limit of {:.0f} Pa, and the tip far from its path",
     "late": "commands come {:.2f} s after their instant",
     "pressures": "chambers are said to hold {:.3g} Pa, which no command has made: are pressures "
     "told in Pa, and is the supply open?",
@@ -41,11 +40,6 @@ _INCONSISTENT = 20.0
 """Squared distance of measurements per coordinate, smoothed, that is too large; 1 is expected."""
 _PATIENCE = 2.0
 """Time for which measurements may be inconsistent [s]."""
-_SATURATED = 3.0
-"""Time for which a correction may be at its limit [s]."""
-_ASTRAY = 0.03
-"""Distance of the tip from r̄, over the limb's length, up to which neither a correction at its limit
-nor one that swings ends feedback: a limb that follows is not left to a plan that may be worse."""
 _SWING = 0.1
 """Way from one turn of a swinging correction to the next, as a share of the authority."""
 _TURNS = 6
@@ -78,7 +72,6 @@ class Supervisor:
 
     Args:
         authority: largest correction [Pa].
-        length: of the limb [m].
 
     Attributes:
         share: 0 … 1.
@@ -86,15 +79,14 @@ class Supervisor:
         warnings: all that were given.
     """
 
-    def __init__(self, authority: float, length: float) -> None:
-        self.authority, self.length = authority, length
+    def __init__(self, authority: float) -> None:
+        self.authority = authority
         self.share = 0.0
         self.reason = ""
         self.warnings: list[Warned] = []
         self._latched = False
         self._since: dict[str, float] = {}
         self._late = 0.0
-        self._astray_at = -math.inf
         self._recent: deque[tuple[Array, float]] = deque(maxlen=round(_WINDOW / CONTROL_PERIOD))
 
     def advance(self, time: float, age: float, strange: float) -> float:
@@ -118,25 +110,17 @@ class Supervisor:
             self.share = min(1.0, self.share + CONTROL_PERIOD / _RAMP)
         return self.share
 
-    def sent(self, time: float, correction: Array, swing: float, missed: float = math.inf) -> None:
+    def sent(self, time: float, correction: Array, swing: float) -> None:
         """Look at a correction that is sent.
 
         Args:
             time: instant of the command [s].
             correction: (M,) [Pa].
             swing: rate at which the limb deviates from the model's motion then [rad/s].
-            missed: distance of the tip from r̄ then [m]; if nobody tells, it is far.
         """
-        astray = missed > _ASTRAY * self.length
-        if astray:
-            self._astray_at = time
-        limited = np.abs(correction).max() > 0.98 * self.authority * self.share
-        in_vain = bool(self.share > 0.0 and limited and astray)
-        if self._lasts("in vain", in_vain, time) > _SATURATED:
-            self.stop(time, "saturation", self.authority)
         self._recent.append((correction, swing))
         distance = self._oscillation()
-        if distance > 0.0 and time - self._astray_at <= _WINDOW:
+        if distance > 0.0:
             self.stop(time, "oscillation", distance)
 
     def held(self, time: float, pressure: float, possible: bool) -> None:
