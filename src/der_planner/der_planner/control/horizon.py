@@ -2,7 +2,10 @@
 
 From the estimate at the instant of the next command on, the linear system of
 `der_planner.control.nominal` is rolled forward under the commands that would be sent without a new
-correction. The corrections c (W, M), added to the plan's commands, then minimise
+correction. It begins with the limb's bends, and with the plan's rates: a command takes effect some
+0.2 s after the picture that it answers, and on a limb whose frequency is not what the model says,
+a swing is by then in another phase than expected and would be driven. Swings are left to the
+limb's own damping. The corrections c (W, M), added to the plan's commands, then minimise
 
     Σ |tip − r̄|² + ν² Σ |δθ|² + λ² Σ |r_k − r_{k−1}|² + λ² Σ |r_k − 2 r_{k−1} + r_{k−2}|²
 
@@ -243,7 +246,7 @@ class Horizon:
         planned = nominal.effective[fine].reshape(self.window, STEPS, inputs).mean(axis=1)
         push = effective.mean(axis=1) * (1.0 + gain) + missing - planned
         pushed = np.einsum("wsb,wb->ws", nominal.input[periods], push)
-        swing = known.mean[: 2 * inputs]
+        swing = np.append(known.mean[:inputs], np.zeros(inputs))
         bends = np.empty((self.window, inputs))
         for i, transition in enumerate(nominal.transition[periods]):
             swing = transition @ swing + pushed[i]
