@@ -75,19 +75,19 @@ def test_commands_keep_all_limits(planned, corrected):
 
 
 def test_a_limb_that_swings_otherwise_than_its_model_is_not_made_worse():
-    # Bends at rest are those of the chain, its file is two and a half times too soft.
+    # Bends at rest are those of the chain, its file is four times too soft.
     chain, segments = Chain().chain, []
     for i, segment in enumerate(Limb.default().segments):
-        stiffness = 0.4 * segment.bending_stiffness
+        stiffness = 0.25 * segment.bending_stiffness
         gain = chain._gain[i].mean() * (1.0 / chain._stiffness.reshape(2, -1)[i]).sum()
         rest = chain._rest[i] / segment.length
         changed = {"bending_stiffness": stiffness, "rest_curvature": rest}
         gain *= stiffness / segment.length
         segments.append(replace(segment, moment_gain=gain, **changed))
     limb = replace(Limb.default(), segments=tuple(segments))
-    fast = plan(limb, Motion.named("asynchronous", amplitude=0.6, period=3.0, cycles=1))
+    fast = plan(limb, Motion.named("asynchronous", amplitude=0.6, period=6.0, cycles=1))
     alone, fed = (play(fast, Chain(), feedback) for feedback in (None, Feedback(fast)))
-    assert fed.error.mean() < 1.15 * alone.error.mean()
+    assert fed.error.mean() < 1.02 * alone.error.mean()
 
 
 def test_feedback_and_learning_do_not_fight(planned):
