@@ -226,13 +226,31 @@ def test_a_limit_lets_the_force_come_to_it(model, touch):
     for limit in (0.1, 0.4):
         reaction = Reaction(model, "yield", limit)
         kept = reacted(reaction, CHAMBERS + 9000.0, CHAMBERS, touch, CHAMBERS)
-        # Something that does not move: the force by which the place stays where it is.
-        limp = compliance(model, touch.bend_angles, [touch.place])
-        along = touch.force / np.linalg.norm(touch.force)
-        moved = along @ limp.place_by_pressure[0] @ (kept - CHAMBERS)
-        told = np.linalg.norm(touch.force) + np.sqrt(along @ touch.force_covariance @ along)
-        force = told - moved / (along @ limp.place[0] @ along)
-        assert force == pytest.approx(limit, abs=1e-6)
+        size = np.linalg.norm(touch.force)
+        along = touch.force / size
+        most = size + np.sqrt(along @ touch.force_covariance @ along)
+        # What bends the limb as the touch does grows with the force.
+        raised = -touch.pressure @ (kept - CHAMBERS) / (touch.pressure @ touch.pressure)
+        assert most + raised * size == pytest.approx(limit, abs=1e-6)
+
+
+def test_a_limit_outlasts_the_touch_until_the_plan_goes_back(model, touch):
+    reaction, harder = Reaction(model, "yield", 0.1), CHAMBERS + 9000.0
+    kept = reacted(reaction, harder, harder, touch, CHAMBERS)
+    ended = untouched(2.0, touch.bend_angles)
+    for _ in range(40):
+        np.testing.assert_array_equal(reacted(reaction, harder, harder, ended, kept), kept)
+    back = kept + 10.0 * touch.pressure / np.linalg.norm(touch.pressure)
+    np.testing.assert_array_equal(reacted(reaction, back, back, ended, kept), back)
+    np.testing.assert_array_equal(reacted(reaction, harder, harder, ended, kept), harder)
+
+
+def test_a_limit_keeps_pressures_until_the_force_is_told(model, touch):
+    reaction = Reaction(model, "yield", 0.4)
+    untold = replace(touch, force=np.full(2, np.nan))
+    first = reacted(reaction, CHAMBERS + 9000.0, CHAMBERS, untold, CHAMBERS)
+    later = reacted(reaction, CHAMBERS + 9000.0, CHAMBERS + 3000.0, untold, first)
+    np.testing.assert_allclose(touch.pressure @ (later - CHAMBERS), 0.0, atol=1e-3)
 
 
 def test_holding_and_venting_keep_what_the_chambers_had(model, touch):
@@ -255,8 +273,18 @@ def test_corrections_stay_while_something_touches_and_come_back_slowly(model, to
     for _ in range(40):
         np.testing.assert_array_equal(reaction.corrected(first + 3000.0), first)
     reaction.follow(CHAMBERS, untouched(3.0, np.zeros(2)), CHAMBERS)
-    came = [reaction.corrected(first + 3000.0)[0] for _ in range(20)]
+    came = [reaction.corrected(first + 3000.0)[0] for _ in range(80)]
     assert np.all(np.diff(came) > 0.0)
+    assert came[-1] == pytest.approx(3500.0)
+
+
+def test_corrections_come_back_sooner_from_what_was_only_suspected(model):
+    reaction, first = Reaction(model, "yield"), np.array([500.0, -200.0])
+    reaction.corrected(first)
+    reaction.follow(CHAMBERS, untouched(1.0, np.zeros(2), distance=0.9), CHAMBERS)
+    np.testing.assert_array_equal(reaction.corrected(first + 3000.0), first)
+    reaction.follow(CHAMBERS, untouched(1.1, np.zeros(2)), CHAMBERS)
+    came = [reaction.corrected(first + 3000.0)[0] for _ in range(20)]
     assert came[-1] == pytest.approx(3500.0)
 
 

@@ -218,10 +218,9 @@ class Feedback:
         """
         first, corrections = self._horizon.solution
         corrections = self._reaction.mixed(self.share * corrections)
-        if self.touch.touched and self._reaction.acts:
-            planned = self._nominal.commands[self._nominal.periods(first + np.arange(_SOON))]
-            for ahead, each in enumerate(planned):
-                corrections[ahead] = self._reaction.allowed(each + corrections[ahead]) - each
+        planned = self._nominal.commands[self._nominal.periods(first + np.arange(_SOON))]
+        for ahead, each in enumerate(planned):
+            corrections[ahead] = self._reaction.allowed(each + corrections[ahead]) - each
         return first, corrections
 
     def sent(self, time: float, command: ArrayLike) -> None:

@@ -6,10 +6,13 @@ Against what touches, the tip stays behind whatever is corrected. From before a 
 A touch is worth an effective pressure ℓ per segment (`Touch.pressure`): bending further against it
 raises the force. A change δu of the pressures in the chambers does so as far as −ℓ·δu > 0. While
 something is touched, `yield` gives no command u with −ℓ·u above that of the plan: what is wanted is
-moved to the nearest command on that side. To retreat farther than the plan would do harm where a
-touch is false. With a limit in N the bound is where the force, with its deviation, would reach it:
-against something that does not move, pressures raise the force at a place with compliance C_p by
-−f̂ᵀ (∂p/∂u) δu / (f̂ᵀ C_p f̂).
+moved to the nearest command on that side. To retreat farther than the plan would do
+harm where a touch is false.
+
+With a limit in N the bound is where the force f, with its deviation, would reach it: a change
+−ℓ·δu is taken to raise the force by |f|/|ℓ|² of it. Until the force can be told, pressures stay
+where the plan had them at the touch. A touch ends once the limb has gone back; the bound stays
+until the plan itself has gone back behind it.
 """
 
 from __future__ import annotations
@@ -22,14 +25,14 @@ import numpy as np
 from der_planner.arrays import Array
 from der_planner.control.touch import Touch
 from der_planner.model import CONTROL_PERIOD, RodModel
-from der_planner.model.compliance import compliance
 
 Kind = Literal["warn", "hold", "yield", "vent"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
 _SUSPECTED = 0.6
 """`Touch.distance` from which on corrections stay what they were."""
-_RETURN = 1.0
-"""Time in which corrections come back once a touch has ended [s]."""
+_RETURN = 1.0, 4.0
+"""Time in which corrections come back once a touch is no longer suspected, and once one has ended:
+the plan may press on what the limb has just left [s]."""
 _SMALLEST = 1e-9
 """A pressure below this gives no direction [Pa]."""
 
@@ -52,11 +55,10 @@ class Reaction:
         if limit is not None and not (math.isfinite(limit) and limit >= 0.0):
             raise ValueError(f"a limit of the force must be 0 N or more, got {limit}")
         self.kind, self.limit = kind, limit
-        self._model = model
         self._held: Array | None = None
-        self._bound = np.zeros(0), 0.0
+        self._bound = np.zeros(model.inputs), 0.0
         self._suspected = False
-        self._free, self._kept = 1.0, np.zeros(model.inputs)
+        self._free, self._kept, self._return = 1.0, np.zeros(model.inputs), _RETURN[0]
 
     @property
     def acts(self) -> bool:
@@ -77,25 +79,37 @@ class Reaction:
             chambers: (M,) differential pressures in them now [Pa].
         """
         self._suspected = self.acts and touch.distance > _SUSPECTED and not touch.weighed
+        harder, bound = self._bound
         if touch.weighed or not (touch.touched and self.acts):
-            self._held = None
+            if self.limit is None or not (self.kind == "yield" and harder @ planned > bound):
+                self._held = None
             return
+        begins = self._held is None
         if self._held is None:
             self._held = chambers
         if self.kind != "yield":
             return
-        harder = -touch.pressure / max(float(np.linalg.norm(touch.pressure)), _SMALLEST)
-        self._bound = harder, float(harder @ planned)
-        if self.limit is not None and np.isfinite([touch.place, *touch.force]).all():
-            self._bound = self._limited(touch, chambers, self.limit)
+        square = max(float(touch.pressure @ touch.pressure), _SMALLEST**2)
+        size = float(np.linalg.norm(touch.force))
+        if self.limit is not None and size > 0.0:
+            along = touch.force / size
+            # The force may be larger than told by its standard deviation.
+            most = size + math.sqrt(float(along @ touch.force_covariance @ along))
+            harder = -size / square * touch.pressure
+            self._bound = harder, float(harder @ chambers) + self.limit - most
+        elif self.limit is None or begins:
+            harder = -touch.pressure / math.sqrt(square)
+            self._bound = harder, float(harder @ planned)
 
     def corrected(self, wanted: Array) -> Array:
         """Return the correction (M,) [Pa] of this control period in place of a wanted one."""
         if self._held is not None or self._suspected:
+            self._return = _RETURN[1] if self._held is not None else self._return
             self._free = 0.0
         else:
-            self._free = min(1.0, self._free + CONTROL_PERIOD / _RETURN)
-            self._kept = wanted if self._free == 1.0 else self._kept
+            self._free = min(1.0, self._free + CONTROL_PERIOD / self._return)
+            if self._free == 1.0:
+                self._kept, self._return = wanted, _RETURN[0]
         return self.mixed(wanted)
 
     def allowed(self, wanted: Array) -> Array:
@@ -111,14 +125,3 @@ class Reaction:
     def mixed(self, wanted: Array) -> Array:
         """Return wanted corrections (…, M) [Pa] as far as they have come back after a touch."""
         return self._kept + self._free * (wanted - self._kept)
-
-    def _limited(self, touch: Touch, chambers: Array, limit: float) -> tuple[Array, float]:
-        """Return how pressures raise the force (M,) [N/Pa], and how far that may go [N]."""
-        limp = compliance(self._model, touch.bend_angles, [touch.place])
-        size = float(np.linalg.norm(touch.force))
-        along = touch.force / size
-        slack = float(along @ limp.place[0] @ along)
-        harder = -(along @ limp.place_by_pressure[0]) / slack
-        # The force may be larger than told by its standard deviation.
-        most = size + math.sqrt(float(along @ touch.force_covariance @ along))
-        return harder, float(harder @ chambers) + limit - most

@@ -28,8 +28,6 @@ class Compliance:
         tip: (P, 2, 2) of the tip by force [m/N].
         place: (P, 2, 2) of the place itself by force [m/N].
         bend_by_pressure: (M, M) by effective pressure [rad/Pa].
-        tip_by_pressure: (2, M) [m/Pa].
-        place_by_pressure: (P, 2, M) [m/Pa].
     """
 
     places: Array
@@ -37,8 +35,6 @@ class Compliance:
     tip: Array
     place: Array
     bend_by_pressure: Array
-    tip_by_pressure: Array
-    place_by_pressure: Array
 
 
 def compliance(model: RodModel, bend_angles: ArrayLike, places: ArrayLike) -> Compliance:
@@ -74,8 +70,6 @@ def compliance(model: RodModel, bend_angles: ArrayLike, places: ArrayLike) -> Co
         np.einsum("ja,pjf->paf", tip_sweep, turns),
         np.einsum("pja,pjf->paf", sweep, turns),
         share @ pressed,
-        tip_sweep.T @ pressed,
-        np.einsum("pja,jm->pam", sweep, pressed),
     )
 
 
