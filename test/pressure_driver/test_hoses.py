@@ -2,8 +2,7 @@
 
 import pytest
 
-from pressure_driver.orders import SettingError
-from pressure_driver.settings import Settings
+from pressure_driver.settings import SettingError, Settings
 
 
 @pytest.mark.parametrize(

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from waiting import Clock
 
-from pressure_driver.emulator.device import BoardReading
+from pressure_driver.emulator import BoardReading
 from pressure_driver.emulator.polled import FestoBoard, PneudriveBoard
-from pressure_driver.protocols import BoardFailure, Echo, Telemetry, host_protocol, modbus
+from pressure_driver.protocols import BoardFailure, Echo, Telemetry, festo, host_protocol
 from pressure_driver.safety import Mode
 from pressure_driver.settings import EmulatorSettings, Settings
 
@@ -18,15 +18,15 @@ ROOM = 101_325.0
 
 def answer(host, *words):
     """Have a terminal say what its registers hold."""
-    data = modbus.to_bytes(words)
-    return host.decode(modbus.encode(7, modbus.READ, bytes([len(data)]) + data))
+    data = festo.to_bytes(words)
+    return host.decode(festo.encode(7, festo.READ, bytes([len(data)]) + data))
 
 
 def told(data):
     """Return first register and words of a write, which is alone: servers lose a second request."""
-    ((_, write),) = modbus.ModbusReader().feed(data)
+    ((_, write),) = festo.ModbusReader().feed(data)
     first, count = struct.unpack(">HH", write.data[:4])
-    words = modbus.to_words(write.data[5:])
+    words = festo.to_words(write.data[5:])
     assert len(words) == count
     return first, words
 
@@ -39,10 +39,10 @@ def test_setpoints_of_a_motion_terminal_stand_behind_the_mode_of_their_slot():
     data, number = host.setpoint([7_540.0, 0.0, 0.0, 20_000.0])
     assert told(data) == (40003, (0xC3, 75, 0, 0xC3, 0, 200))
     assert host.follow_up() == b""
-    assert host.decode(modbus.encode(number, modbus.WRITE, struct.pack(">HH", 40003, 6))) == [
+    assert host.decode(festo.encode(number, festo.WRITE, struct.pack(">HH", 40003, 6))) == [
         Echo(number)
     ]
-    assert host.follow_up()[7:] == struct.pack(">BHH", modbus.READ, 45395, 6)
+    assert host.follow_up()[7:] == struct.pack(">BHH", festo.READ, 45395, 6)
     assert host.follow_up() == b""
 
 
@@ -104,7 +104,7 @@ def test_a_terminal_with_regulators_is_played(simulate):
     assert sim.gauge[0] > 2_000.0
     first, words = told(sim.sent[-1])
     assert (first, len(words)) == (40003, 4)
-    assert all(modbus.signed(word) >= 0 for word in words)
+    assert all(festo.signed(word) >= 0 for word in words)
 
 
 def test_a_diagnosis_of_a_regulator_is_a_failure():

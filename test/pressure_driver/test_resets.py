@@ -95,7 +95,7 @@ def test_one_damaged_report_of_a_ctrlp_board_is_no_reset():
 def test_echoes_and_warnings_of_a_ctrlp_board_are_no_reset():
     host = host_protocol("ctrlp")
     board = BOARDS["ctrlp"]()
-    from pressure_driver.emulator.device import BoardReading
+    from pressure_driver.emulator import BoardReading
 
     reading = BoardReading(0.0, (101_325.0,) * 4, 101_325.0, (0.0,) * 4, 0.0)
     answers = b"".join(
@@ -136,7 +136,7 @@ def test_lines_of_setpoints_and_of_the_supply_are_no_damage():
 
 def test_the_clock_of_a_native_board_may_overflow():
     host, board = host_protocol("native"), BOARDS["native"]()
-    from pressure_driver.emulator.device import BoardReading
+    from pressure_driver.emulator import BoardReading
 
     def status(milliseconds):
         reading = BoardReading(

@@ -3,10 +3,9 @@
 import pytest
 
 from pressure_driver.emulator.firmware import NativeBoard
-from pressure_driver.orders import SettingError
 from pressure_driver.protocols import BoardFailure, BoardIdentity, Echo, Telemetry, host_protocol
-from pressure_driver.settings import TopicBoardSettings
-from pressure_driver.topic_board.board import STALE, Scale, WatchedBoard
+from pressure_driver.settings import SettingError, TopicBoardSettings
+from pressure_driver.topic_board import STALE, Scale, WatchedBoard
 
 ROOM = 101_325.0
 READING = (7_000.0, 0.0, 0.0, 3_000.0)

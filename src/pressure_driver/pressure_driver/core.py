@@ -9,10 +9,9 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pressure_driver.following import chamber_gauge
-from pressure_driver.orders import order_of
 from pressure_driver.protocols import (
     STANDARD_ATMOSPHERE,
     BoardFailure,
@@ -26,10 +25,8 @@ from pressure_driver.protocols import (
 )
 from pressure_driver.safety import LIVE, Mode, SafetyMachine
 from pressure_driver.schedule import NANOSECONDS, Origin, RunningClock, Setpoint, Verdict
+from pressure_driver.settings import Settings
 from pressure_driver.telemetry import Condition, TelemetryMonitor
-
-if TYPE_CHECKING:
-    from pressure_driver.settings import Settings
 
 LARGEST_CLOCK_STEP = 0.3
 """[s] between two ticks, above slewing and late wakes, that means the wall clock was set."""
@@ -147,7 +144,7 @@ class DriverCore:
         self.monitor = TelemetryMonitor(protocol, settings)
         self.machine = SafetyMachine(settings, self.monitor, self._conditions)
         self.board = BoardWatch(protocol, settings)
-        self._valves = order_of(settings.wiring, protocol.chamber_count)
+        self._valves = settings.valves
         self._log = log
         self._link_fault = "the serial port is not open"
         self._texts: deque[str] = deque()

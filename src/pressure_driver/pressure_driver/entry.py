@@ -12,29 +12,14 @@ import socket
 import sys
 import time
 from collections import deque
+from functools import partial
 from typing import Any
 
 from pressure_driver.board import BoardProcess
 from pressure_driver.lines import Channel
-from pressure_driver.orders import SettingError
 from pressure_driver.port_process import explain, stable_name
 from pressure_driver.safety import Mode
-from pressure_driver.settings import Settings, declarations
-
-
-def pressure_driver() -> int:
-    """Run the driver."""
-    return _run_node("pressure_driver.node")
-
-
-def board_emulator() -> int:
-    """Run the emulated board."""
-    return _run_node("pressure_driver.emulator.node")
-
-
-def topic_board() -> int:
-    """Run the board that a lab's own driver of valves is."""
-    return _run_node("pressure_driver.topic_board.node")
+from pressure_driver.settings import SettingError, Settings, declarations
 
 
 def _run_node(module: str) -> int:
@@ -50,6 +35,11 @@ def _run_node(module: str) -> int:
         os.nice(-15)
     os.environ.setdefault("RMW_FASTRTPS_PUBLICATION_MODE", "ASYNCHRONOUS")
     return int(run_module(module))
+
+
+pressure_driver = partial(_run_node, "pressure_driver.node")
+board_emulator = partial(_run_node, "pressure_driver.emulator.node")
+topic_board = partial(_run_node, "pressure_driver.topic_board.node")
 
 
 class Terminal(Channel):

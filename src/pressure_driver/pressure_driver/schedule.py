@@ -12,10 +12,9 @@ from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
-if TYPE_CHECKING:
-    from pressure_driver.settings import Settings
+from pressure_driver.settings import Settings
 
 NANOSECONDS = 1_000_000_000
 CAPACITY = 4096

@@ -4,7 +4,7 @@ import crcmod.predefined
 import numpy as np
 import pytest
 
-from pressure_driver.emulator.device import BoardReading
+from pressure_driver.emulator import BoardReading
 from pressure_driver.emulator.firmware import BOARDS, NativeBoard
 from pressure_driver.emulator.polled import BUS_PATIENCE
 from pressure_driver.following import chamber_gauge

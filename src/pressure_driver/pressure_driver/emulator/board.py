@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from pressure_driver.emulator.device import BoardCommand, BoardProtocol, BoardReading
+from pressure_driver.emulator import BoardCommand, BoardProtocol, BoardReading
 from pressure_driver.emulator.pneumatics import SUPPLY_PRESSURE, BoardPneumatics
 
 SENSOR_OFFSET = 200.0

@@ -7,7 +7,7 @@ import re
 import struct
 from collections.abc import Sequence
 
-from pressure_driver.emulator.device import BoardCommand, BoardProtocol, BoardReading
+from pressure_driver.emulator import BoardCommand, BoardProtocol, BoardReading
 from pressure_driver.emulator.polled import FestoBoard, PneudriveBoard
 from pressure_driver.protocols import LineSplitter
 from pressure_driver.protocols.ctrlp import PASCAL_PER_KILOPASCAL

@@ -21,8 +21,7 @@ from pressure_driver.emulator.firmware import BOARDS
 from pressure_driver.emulator.pneumatics import BoardPneumatics
 from pressure_driver.emulator.runner import BoardRunner, emulated_line
 from pressure_driver.node import read_settings
-from pressure_driver.orders import order_of
-from pressure_driver.settings import EmulatorSettings
+from pressure_driver.settings import EmulatorSettings, order_of
 
 
 class BoardEmulator(Node):

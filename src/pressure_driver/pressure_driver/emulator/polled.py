@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
-from pressure_driver.emulator.device import BoardCommand, BoardProtocol, BoardReading
-from pressure_driver.protocols import festo, modbus, pneudrive
-
-if TYPE_CHECKING:
-    from pressure_driver.settings import EmulatorSettings
+from pressure_driver.emulator import BoardCommand, BoardProtocol, BoardReading
+from pressure_driver.protocols import festo, pneudrive
+from pressure_driver.settings import EmulatorSettings
 
 BUS_PATIENCE = 1.0
 """[s] without a write, after which a terminal takes the bus for lost and resets its outputs."""
@@ -53,7 +50,7 @@ class FestoBoard(BoardProtocol):
 
     def __init__(self, chamber_count: int = 4) -> None:
         super().__init__(chamber_count)
-        self._frames = modbus.ModbusReader()
+        self._frames = festo.ModbusReader()
         self._motion_terminal = True
         self.boot(0.0)
 
@@ -75,26 +72,26 @@ class FestoBoard(BoardProtocol):
         self.rejected += self._frames.rejected - before
         return commands
 
-    def _interpret(self, place: int, frame: modbus.ModbusFrame) -> BoardCommand:
+    def _interpret(self, place: int, frame: festo.ModbusFrame) -> BoardCommand:
         function, data, number = frame.function, frame.data, frame.transaction
-        first, count = modbus.BLOCK.unpack(data[:4].ljust(4, b"\0"))
-        if function == modbus.READ:
+        first, count = festo.BLOCK.unpack(data[:4].ljust(4, b"\0"))
+        if function == festo.READ:
             return BoardCommand("read", place, sequence=number, text=f"{first} {count}")
-        words, offset = modbus.to_words(data[5:]), first - festo.FIRST_OUTPUT
+        words, offset = festo.to_words(data[5:]), first - festo.FIRST_OUTPUT
         inside = 0 <= offset <= len(self._outputs) - count
-        if function == modbus.WRITE and inside and len(words) == count:
+        if function == festo.WRITE and inside and len(words) == count:
             self._outputs[offset : offset + count] = words
             for slot, word in zip(self.slots, self._outputs[0::3], strict=False):
                 slot.tell(word)
             told = self._setpoints()
             return BoardCommand("setpoint", place, told, BUS_PATIENCE, number, f"{first} {count}")
         self.rejected += 1
-        problem = ILLEGAL_ADDRESS if function == modbus.WRITE else ILLEGAL_FUNCTION
+        problem = ILLEGAL_ADDRESS if function == festo.WRITE else ILLEGAL_FUNCTION
         return BoardCommand("refused", place, sequence=number, text=f"{function} {problem}")
 
     def _setpoints(self) -> tuple[float, ...]:
         values = [v for place, v in enumerate(self._outputs) if place % 3 or not self.slots]
-        millibar = (modbus.signed(value) for value in values)
+        millibar = (festo.signed(value) for value in values)
         # Regulators of an MPA terminal that are told less than nothing open wide.
         wild = 0 if self.slots else festo.LARGEST_SETPOINT
         return tuple(
@@ -128,14 +125,14 @@ class FestoBoard(BoardProtocol):
         """Registers to a read, first register and their number to a write, else an exception."""
         number, (first, second) = command.sequence or 0, map(int, command.text.split())
         if command.kind == "refused":
-            return modbus.encode(number, first | modbus.FAILED, bytes([second]))
+            return festo.encode(number, first | festo.FAILED, bytes([second]))
         if command.kind == "setpoint":
-            return modbus.encode(number, modbus.WRITE, modbus.BLOCK.pack(first, second))
+            return festo.encode(number, festo.WRITE, festo.BLOCK.pack(first, second))
         words, offset = self._inputs(reading), first - festo.FIRST_INPUT
         if not 0 <= offset <= len(words) - second:
-            return modbus.encode(number, modbus.READ | modbus.FAILED, bytes([ILLEGAL_ADDRESS]))
-        data = modbus.to_bytes(words[offset : offset + second])
-        return modbus.encode(number, modbus.READ, bytes([len(data)]) + data)
+            return festo.encode(number, festo.READ | festo.FAILED, bytes([ILLEGAL_ADDRESS]))
+        data = festo.to_bytes(words[offset : offset + second])
+        return festo.encode(number, festo.READ, bytes([len(data)]) + data)
 
     def expired(self) -> bytes:
         """The bus is lost: all outputs are zero, and slots have to be started again."""

@@ -82,46 +82,8 @@ class BoardIdentity:
 Event = Telemetry | Echo | BoardFailure | BoardReset | BoardText | BoardIdentity
 
 
-class StreamCutter:
-    """Collects bytes and returns complete pieces with the place of their first byte.
-
-    Args:
-        end: the byte after each piece.
-        longest: bytes; of a longer piece everything up to its end is dropped.
-    """
-
-    def __init__(self, end: bytes, longest: int) -> None:
-        self._end = end
-        self._longest = longest
-        self._buffer = bytearray()
-        self._position = 0
-        self._overlong = False
-
-    def feed(self, data: bytes) -> list[tuple[int, bytes | None]]:
-        """Return (place of the first byte, piece without its end); None for one too long."""
-        pieces: list[tuple[int, bytes | None]] = []
-        self._buffer += data
-        while (end := self._buffer.find(self._end)) >= 0:
-            too_long = self._overlong or end > self._longest
-            pieces.append((self._position, None if too_long else bytes(self._buffer[:end])))
-            del self._buffer[: end + 1]
-            self._position += end + 1
-            self._overlong = False
-        if len(self._buffer) > self._longest:
-            self._position += len(self._buffer)
-            self._buffer.clear()
-            self._overlong = True
-        return pieces
-
-    def reset(self) -> None:
-        """Forget a half-received piece."""
-        self._position += len(self._buffer)
-        self._buffer.clear()
-        self._overlong = False
-
-
 class FrameBuffer:
-    """Bytes that are cut into frames whose length is known, and how often some were skipped."""
+    """Bytes that are cut into frames or lines, and how often some were skipped."""
 
     def __init__(self) -> None:
         self.rejected = 0
@@ -147,7 +109,41 @@ class FrameBuffer:
         self.take(len(self.kept))
 
 
-class LineSplitter:
+class StreamCutter(FrameBuffer):
+    """Cuts a stream into pieces at the byte that ends each of them.
+
+    Args:
+        end: the byte after each piece.
+        longest: bytes; of a longer piece everything up to its end is dropped.
+    """
+
+    def __init__(self, end: bytes, longest: int) -> None:
+        super().__init__()
+        self._end = end
+        self._longest = longest
+        self._overlong = False
+
+    def cut(self, data: bytes) -> list[tuple[int, bytes | None]]:
+        """Return (place of the first byte, piece without its end); None for one too long."""
+        pieces: list[tuple[int, bytes | None]] = []
+        self.kept += data
+        while (end := self.kept.find(self._end)) >= 0:
+            too_long = self._overlong or end > self._longest
+            place, piece = self.position, self.take(end + 1)[:-1]
+            pieces.append((place, None if too_long else piece))
+            self._overlong = False
+        if len(self.kept) > self._longest:
+            self.take(len(self.kept))
+            self._overlong = True
+        return pieces
+
+    def reset(self) -> None:
+        """Forget a half-received piece."""
+        super().reset()
+        self._overlong = False
+
+
+class LineSplitter(StreamCutter):
     """Collects bytes and returns complete lines with the place of their first byte.
 
     Lines end with a line feed; carriage returns and blanks at either end are dropped, and so are
@@ -155,22 +151,18 @@ class LineSplitter:
     """
 
     def __init__(self) -> None:
-        self._pieces = StreamCutter(b"\n", LONGEST_LINE)
+        super().__init__(b"\n", LONGEST_LINE)
 
     def feed(self, data: bytes) -> list[tuple[int, str | None]]:
         """Return (place of the first byte, text) of the complete lines; None for a damaged one."""
         lines: list[tuple[int, str | None]] = []
-        for start, raw in self._pieces.feed(data):
+        for start, raw in self.cut(data):
             text = (raw or b"").strip()
             if raw is None or any(byte != 9 and not 32 <= byte < 127 for byte in text):
                 lines.append((start, None))
             elif text:
                 lines.append((start + len(raw) - len(raw.lstrip()), text.decode("ascii")))
         return lines
-
-    def reset(self) -> None:
-        """Forget a half-received line."""
-        self._pieces.reset()
 
 
 class HostProtocol(ABC):
@@ -202,6 +194,8 @@ class HostProtocol(ABC):
     """[s] steady."""
     room: Callable[[], float]
     """[Pa] absolute, of the atmosphere, where the wire wants absolute pressures."""
+    _frames: FrameBuffer
+    """Bytes that have been received by halves."""
 
     def __init__(self, chamber_count: int = 4) -> None:
         self.chamber_count = chamber_count
@@ -255,9 +249,9 @@ class HostProtocol(ABC):
     def decode(self, data: bytes) -> list[Event]:
         """Take the next bytes of the stream and return what became complete. Never raises."""
 
-    @abstractmethod
     def reset(self) -> None:
-        """Forget half-received bytes, as after a reconnect."""
+        """Forget half-received bytes and what the board has said, as after a reconnect."""
+        self._frames.reset()
 
 
 class LineHost(HostProtocol):
@@ -265,12 +259,12 @@ class LineHost(HostProtocol):
 
     def __init__(self, chamber_count: int = 4) -> None:
         super().__init__(chamber_count)
-        self._lines = LineSplitter()
+        self._frames: LineSplitter = LineSplitter()
 
     def decode(self, data: bytes) -> list[Event]:
         """Return what complete lines say; damaged lines are counted in ``rejected``."""
         events: list[Event] = []
-        for _, line in self._lines.feed(data):
+        for _, line in self._frames.feed(data):
             event = self._parse(line) if line else None
             if event is not None:
                 events.append(event)
@@ -282,10 +276,6 @@ class LineHost(HostProtocol):
     @abstractmethod
     def _parse(self, line: str) -> Event | None:
         """Return what a line says; None: it is damaged."""
-
-    def reset(self) -> None:
-        """Forget a half-received line."""
-        self._lines.reset()
 
 
 def host_protocol(

@@ -17,19 +17,41 @@ valve, which reads back as 61, and after half a second 3 for both; it runs some 
 
 ``mpa``: valve i has one register at 40003 + i for its setpoint, and three from 45395 + 3i on:
 pressure, setpoint, diagnosis. A negative setpoint would make it go wild: none is ever sent.
+
+A frame of Modbus TCP is ``transaction u16, 0 u16, length u16, unit u8, function u8, data``, all
+big-endian; the length counts what follows it. (Modbus Messaging on TCP/IP Implementation Guide
+V1.0b.) Register numbers are those on the wire, which count from 0, as in lib
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+import struct
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
-from pressure_driver.protocols import BoardFailure, Echo, Event, HostProtocol, Telemetry, modbus
+from pressure_driver.protocols import (
+    BoardFailure,
+    Echo,
+    Event,
+    FrameBuffer,
+    HostProtocol,
+    Telemetry,
+)
+from pressure_driver.settings import Settings
 
-if TYPE_CHECKING:
-    from pressure_driver.settings import Settings
-
+HEADER = struct.Struct(">HHHBB")
+BLOCK = struct.Struct(">HH")
+UNIT = 0xFF
+"""What is spoken to is the server itself, and no device behind it."""
+READ = 3
+WRITE = 16
+FAILED = 0x80
+"""Added to the function in the answer to a request that is refused."""
+LONGEST_LENGTH = 254
+"""[bytes] of unit, function and data."""
+LENGTH_BEGINS = 6
+"""[bytes] before those that the length counts."""
 FIRST_OUTPUT = 40003
 FIRST_INPUT = 45395
 INPUTS = 3
@@ -46,6 +68,57 @@ ACKNOWLEDGE_TIME = 0.5
 START_TIME = 20.0
 """[s] after which slots that do not run yet are started again."""
 _UNKNOWN = "the valves have not said yet that they run"
+
+
+class ModbusFrame(NamedTuple):
+    """One request or answer."""
+
+    transaction: int
+    function: int
+    data: bytes
+
+
+def encode(transaction: int, function: int, data: bytes) -> bytes:
+    """Return the bytes of a frame."""
+    return HEADER.pack(transaction & 0xFFFF, 0, len(data) + 2, UNIT, function) + data
+
+
+def to_bytes(words: Iterable[int]) -> bytes:
+    """Return registers as they are sent; negative numbers as their two's complement."""
+    return b"".join((word & 0xFFFF).to_bytes(2, "big") for word in words)
+
+
+def to_words(data: bytes) -> tuple[int, ...]:
+    """Return registers, 0 … 65535; half a register at the end is left out."""
+    return struct.unpack_from(f">{len(data) // 2}H", data)
+
+
+def signed(word: int) -> int:
+    """Return a register as a number of 16 bits with sign."""
+    return word - 0x10000 if word & 0x8000 else word
+
+
+class ModbusReader(FrameBuffer):
+    """Cuts a byte stream into frames.
+
+    TCP loses and changes nothing. What does not begin as a frame is skipped to where one may begin.
+    """
+
+    def feed(self, data: bytes) -> list[tuple[int, ModbusFrame]]:
+        """Return (place of the first byte, frame) of those that became complete."""
+        frames: list[tuple[int, ModbusFrame]] = []
+        self.kept += data
+        while len(self.kept) >= HEADER.size:
+            transaction, zero, length, _, function = HEADER.unpack_from(self.kept)
+            if zero or not 2 < length <= LONGEST_LENGTH:
+                # The two zero bytes stand behind the transaction.
+                self.skip_to(self.kept.find(b"\0\0", 3) - 2)
+                continue
+            if len(self.kept) < LENGTH_BEGINS + length:
+                break
+            place, frame = self.position, self.take(LENGTH_BEGINS + length)
+            frames.append((place, ModbusFrame(transaction, function, frame[HEADER.size :])))
+        return frames
 
 
 def slot_word(mode: int, control: int) -> int:
@@ -70,7 +143,7 @@ class FestoHost(HostProtocol):
     def __init__(self, chamber_count: int = 4) -> None:
         super().__init__(chamber_count)
         self._motion_terminal = True
-        self._frames = modbus.ModbusReader()
+        self._frames: ModbusReader = ModbusReader()
         self._transaction = 0
         self.reset()
 
@@ -80,7 +153,7 @@ class FestoHost(HostProtocol):
 
     def reset(self) -> None:
         """Forget a half-received frame and whether the valves run."""
-        self._frames.reset()
+        super().reset()
         self._follow_up = b""
         self._sound = self._acknowledging = False
         self._started_at = -math.inf
@@ -130,8 +203,8 @@ class FestoHost(HostProtocol):
             task = (ACKNOWLEDGE, FIRST_VALVE) if acknowledge else (REGULATE, BOTH_VALVES)
             for place in range(0, len(words) * 3 // 2, 3):
                 words.insert(place, slot_word(*task))
-        head = modbus.BLOCK.pack(FIRST_OUTPUT, len(words)) + bytes([2 * len(words)])
-        return modbus.encode(self._next(), modbus.WRITE, head + modbus.to_bytes(words))
+        head = BLOCK.pack(FIRST_OUTPUT, len(words)) + bytes([2 * len(words)])
+        return encode(self._next(), WRITE, head + to_bytes(words))
 
     # ----------------------------------------------------------------------- from the terminal
 
@@ -146,22 +219,19 @@ class FestoHost(HostProtocol):
         self.rejected += self._frames.rejected - before
         return events
 
-    def _interpret(self, frame: modbus.ModbusFrame) -> list[Event]:
-        if frame.function == modbus.WRITE and len(frame.data) == modbus.BLOCK.size:
-            block = modbus.BLOCK.pack(FIRST_INPUT, INPUTS * self._places)
-            self._follow_up = modbus.encode(self._next(), modbus.READ, block)
+    def _interpret(self, frame: ModbusFrame) -> list[Event]:
+        if frame.function == WRITE and len(frame.data) == BLOCK.size:
+            block = BLOCK.pack(FIRST_INPUT, INPUTS * self._places)
+            self._follow_up = encode(self._next(), READ, block)
             return [Echo(frame.transaction)]
-        if (
-            frame.function in (modbus.READ | modbus.FAILED, modbus.WRITE | modbus.FAILED)
-            and len(frame.data) == 1
-        ):
-            asked = "read" if frame.function == modbus.READ | modbus.FAILED else "write"
+        if frame.function in (READ | FAILED, WRITE | FAILED) and len(frame.data) == 1:
+            asked = "read" if frame.function == READ | FAILED else "write"
             said = f"refused: a {asked} of registers, exception {frame.data[0]}"
             return [BoardFailure(f"{said}; look at 'terminal' and 'segment_count'")]
         size = 2 * INPUTS * self._places
-        if frame.function != modbus.READ or len(frame.data) != size + 1 or frame.data[0] != size:
+        if frame.function != READ or len(frame.data) != size + 1 or frame.data[0] != size:
             return []
-        words = modbus.to_words(frame.data[1:])
+        words = to_words(frame.data[1:])
         return self._slots(words) if self._motion_terminal else self._regulators(words)
 
     def _slots(self, words: Sequence[int]) -> list[Event]:
@@ -195,6 +265,6 @@ class FestoHost(HostProtocol):
         if self._sound:
             self._acknowledging = False
             self._started_at = -math.inf  # whatever fails next is started again at once
-        gauge = (PASCAL_PER_MILLIBAR * modbus.signed(word) for word in pressures)
+        gauge = (PASCAL_PER_MILLIBAR * signed(word) for word in pressures)
         readings = tuple(self.assumed_atmosphere + value for value in gauge)
         return [*events, Telemetry(chamber_pressure=readings)]

@@ -13,7 +13,6 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import TYPE_CHECKING
 
 from cobs import cobs
 
@@ -28,9 +27,7 @@ from pressure_driver.protocols import (
     StreamCutter,
     Telemetry,
 )
-
-if TYPE_CHECKING:
-    from pressure_driver.settings import Settings
+from pressure_driver.settings import Settings
 
 VERSION = 1
 HEADER = struct.Struct("<BBH")
@@ -115,20 +112,15 @@ def encode(kind: FrameType, sequence: int, body: bytes = b"") -> bytes:
     return seal(HEADER.pack(VERSION, kind, sequence & 0xFFFF) + body)
 
 
-class FrameSplitter:
+class FrameSplitter(StreamCutter):
     """Cuts a byte stream into frames of this version and of known type."""
 
     def __init__(self) -> None:
-        self._pieces = StreamCutter(b"\0", LONGEST_FRAME)
+        super().__init__(b"\0", LONGEST_FRAME)
 
     def feed(self, data: bytes) -> list[tuple[int, Frame | None]]:
         """Return (place of the first byte, frame); None for one that is damaged or not known."""
-        pieces = self._pieces.feed(data)
-        return [(place, _read(coded)) for place, coded in pieces if coded != b""]
-
-    def reset(self) -> None:
-        """Forget a half-received frame."""
-        self._pieces.reset()
+        return [(place, _read(coded)) for place, coded in self.cut(data) if coded != b""]
 
 
 def _read(coded: bytes | None) -> Frame | None:
@@ -154,7 +146,7 @@ class NativeHost(HostProtocol):
 
     def __init__(self, chamber_count: int = 4) -> None:
         super().__init__(chamber_count)
-        self._frames = FrameSplitter()
+        self._frames: FrameSplitter = FrameSplitter()
         self._sequence = 0
         self._board_time: int | None = None
         self._validity = VALIDITY
@@ -243,5 +235,5 @@ class NativeHost(HostProtocol):
 
     def reset(self) -> None:
         """Forget a half-received frame, and the board's clock."""
-        self._frames.reset()
+        super().reset()
         self._board_time = None

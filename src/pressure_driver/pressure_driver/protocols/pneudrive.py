@@ -14,12 +14,9 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 from pressure_driver.protocols import Echo, Event, FrameBuffer, HostProtocol, Telemetry
-
-if TYPE_CHECKING:
-    from pressure_driver.settings import EmulatorSettings, Settings
+from pressure_driver.settings import EmulatorSettings, Settings
 
 FRAME = struct.Struct(">5H")
 FIRST_ADDRESS = 0xFFFF
@@ -88,17 +85,13 @@ class PneudriveHost(HostProtocol):
 
     def __init__(self, chamber_count: int = 4) -> None:
         super().__init__(chamber_count)
-        self._frames = Frames(chamber_count)
+        self._frames: Frames = Frames(chamber_count)
         self.resolution = self._frames.resolution
 
     def configure(self, settings: Settings) -> None:
         """Take over the board's number and the range of its sensors."""
         self._frames.configure(settings)
         self.resolution = self._frames.resolution
-
-    def reset(self) -> None:
-        """Forget a half-received frame."""
-        self._frames.reset()
 
     def start(self) -> bytes:
         """Nothing: the board speaks when it is spoken to."""

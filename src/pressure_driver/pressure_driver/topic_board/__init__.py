@@ -1,1 +1,98 @@
-"""A lab's own driver of valves as a board."""
+"""What makes a lab's own driver of valves a `native` board: its numbers, and what is watched."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+from pressure_driver.emulator import BoardReading
+from pressure_driver.emulator.firmware import NativeBoard
+from pressure_driver.settings import TopicBoardSettings, order_of
+
+STALE = 0.2
+"""[s] after which readings are not told any more."""
+
+
+class Scale:
+    """Between the numbers of a lab's topic and gauge pressures.
+
+    Args:
+        settings: `scale` is what one Pa is on the topic, `offset` what is added to that; with
+            `absolute` the room's pressure is part of it. `order` names, for each place of the
+            lab's array, the chamber that stands there.
+
+    Raises:
+        SettingError: the order does not name every chamber once.
+    """
+
+    def __init__(self, settings: TopicBoardSettings) -> None:
+        count = 2 * settings.segment_count
+        self._order = order_of(settings.order, count, first=0, name="order")
+        self._scale, self._offset = settings.scale, settings.offset
+        self._room = settings.atmosphere if settings.absolute else 0.0
+
+    def to_topic(self, gauge: Sequence[float]) -> list[float]:
+        """Return what a lab is told, in its order, for gauge pressures (2M,) [Pa]."""
+        return [(gauge[k] + self._room) * self._scale + self._offset for k in self._order]
+
+    def from_topic(self, told: Sequence[float]) -> list[float]:
+        """Return gauge pressures (2M,) [Pa] for what a lab tells, in its order."""
+        gauge = [(value - self._offset) / self._scale - self._room for value in told]
+        return [gauge[self._order.index(chamber)] for chamber in range(len(gauge))]
+
+
+class WatchedBoard:
+    """What a native board does, with pressures that are regulated somewhere else.
+
+    Args:
+        firmware: the board's end of the protocol.
+        atmosphere: [Pa] of the room.
+        regulate: takes gauge pressures (2M,) [Pa], all zero to vent.
+    """
+
+    def __init__(
+        self,
+        firmware: NativeBoard,
+        atmosphere: float,
+        regulate: Callable[[Sequence[float]], None],
+    ) -> None:
+        self._firmware, self._regulate = firmware, regulate
+        count = firmware.chamber_count
+        self._zero = (0.0,) * count
+        self._reading = BoardReading(0.0, (atmosphere,) * count, atmosphere, self._zero, 0.0)
+        self._valid_until = math.inf
+        self._measured_at = -math.inf
+
+    def receive(self, data: bytes, now: float) -> bytes:
+        """Execute the commands of the driver; return the answers (steady clock [s])."""
+        answers = b""
+        for command in self._firmware.decode(data):
+            if command.kind in ("setpoint", "vent"):
+                self._valid_until = now + (command.valid_for or math.inf)
+                vented, number = command.kind == "vent", command.sequence or 0
+                self._reading = replace(
+                    self._reading, last_sequence=number, vented=vented, expired=False
+                )
+                self._regulate(command.pressure or self._zero)
+            # An answer holds readings: old ones would pass for new ones.
+            fresh = now - self._measured_at < STALE
+            if fresh or command.kind in ("hello", "refused"):
+                answers += self._firmware.reply(command, replace(self._reading, time=now))
+        return answers
+
+    def look(self, now: float) -> bytes:
+        """Vent if the last setpoint is not valid any more; return what is to be said about it."""
+        if now <= self._valid_until:
+            return b""
+        self._valid_until = math.inf
+        self._reading = replace(self._reading, vented=True, expired=True)
+        self._regulate(self._zero)
+        return self._firmware.expired()
+
+    def measured(self, gauge: Sequence[float], now: float) -> bytes:
+        """Take gauge pressures (2M,) [Pa]; return the report for the driver."""
+        absolute = tuple(self._reading.atmosphere + pressure for pressure in gauge)
+        self._measured_at = now
+        self._reading = replace(self._reading, time=now, chamber_pressure=absolute)
+        return self._firmware.telemetry(self._reading)

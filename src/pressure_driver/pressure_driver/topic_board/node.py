@@ -22,7 +22,7 @@ from pressure_driver.board_socket import BoardSocket
 from pressure_driver.emulator.firmware import NativeBoard
 from pressure_driver.node import read_settings
 from pressure_driver.settings import TopicBoardSettings
-from pressure_driver.topic_board.board import Scale, WatchedBoard
+from pressure_driver.topic_board import Scale, WatchedBoard
 
 LOOK = 0.005
 """[s] between two looks for bytes of the driver."""
