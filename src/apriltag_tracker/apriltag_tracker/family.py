@@ -16,9 +16,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Layout = tuple[int, int]
-"""Cells along the edge of the inner code, and rings of code cells beyond the border's margin."""
-
 _STANDARD_CODES = Path(__file__).parent / "data" / "standard_families.npz"
 
 
@@ -63,11 +60,6 @@ class Family:
         return self.dictionary_id is None
 
     @property
-    def layout(self) -> Layout:
-        """Where the cells of the code are."""
-        return self.code_cells, int(self.outer_ring)
-
-    @property
     def border_cells(self) -> int:
         """Cells along the edge of the border, which `size` of a tag means."""
         return self.code_cells + 2
@@ -96,12 +88,16 @@ class Family:
             cv2.aruco.Dictionary.getByteListFromBits(cells), self.code_cells, 0
         )
 
-    def code_mask(self) -> NDArray[np.bool_]:
-        """Tell which cells of a tag with its rim belong to the code, (n, n)."""
+    def rings(self) -> NDArray[np.int64]:
+        """Tell in which ring each cell of a tag with its rim is, (n, n): 0 is the border."""
         across = np.arange(self.tag_cells)
         inward = np.minimum(across, across[::-1]) - self.rim
-        ring = np.minimum(inward[:, None], inward[None, :])
-        mask: NDArray[np.bool_] = (ring >= 1) | (ring <= -2)
+        return np.minimum(inward[:, None], inward[None, :])
+
+    def code_mask(self) -> NDArray[np.bool_]:
+        """Tell which cells of a tag with its rim belong to the code, (n, n)."""
+        rings = self.rings()
+        mask: NDArray[np.bool_] = (rings >= 1) | (rings <= -2)
         return mask
 
     def codes(self) -> NDArray[np.uint8]:

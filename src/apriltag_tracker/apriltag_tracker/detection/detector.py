@@ -210,7 +210,7 @@ class Detector:
     def _candidates(self, image: NDArray[np.uint8], quads: NDArray[np.float64]) -> _Candidates:
         """Refine quadrilaterals (n, 4, 2) px and read their cells."""
         corners, covariances, residuals, found = refine_quads(image, quads, _SEARCH)
-        misfits, codes = read_codes(image, corners, self.family.layout)
+        misfits, codes = read_codes(image, corners, self.family)
         along, across = corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1]
         good = found & (residuals <= _LARGEST_RESIDUAL) & (misfits < UNREADABLE)
         good &= misfits <= self.family.largest_misfit
