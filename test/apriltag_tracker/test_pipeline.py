@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from apriltag_tracker.camera import pinhole
-from apriltag_tracker.detection import Detector, codes, edges
+from apriltag_tracker.detection import Detector, edges
 from apriltag_tracker.pipeline import LimbTracker, TrackerOptions, warm_up
 from apriltag_tracker.pose.following import Uncertainty
 from apriltag_tracker.synthetic.camera import Errors, Optics, SyntheticCamera
@@ -129,4 +129,4 @@ def test_tags_at_another_height_or_place_are_left_out_by_name(straight_tags, mod
 def test_warming_up_leaves_no_kernel_for_the_first_image(detector):
     warm_up(detector)
     lens = (pinhole.undistort_pixels, pinhole.distort_to_pixels)
-    assert all(len(each.signatures) == 1 for each in (edges.refine_quads, codes.read_codes, *lens))
+    assert all(len(each.signatures) == 1 for each in (edges.refine_quads, *lens))

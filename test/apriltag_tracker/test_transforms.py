@@ -8,7 +8,7 @@ from builtin_interfaces.msg import Time
 from scipy.spatial.transform import Rotation
 
 from apriltag_tracker.camera import CameraPose
-from apriltag_tracker.state_messages import camera_transform, limb_transforms, transforms_type
+from apriltag_tracker.pose.node import camera_transform, limb_transforms, transforms_type
 
 STAMP = Time(sec=3, nanosec=5)
 

@@ -92,7 +92,7 @@ class Family:
         """Tell in which ring each cell of a tag with its rim is, (n, n): 0 is the border."""
         across = np.arange(self.tag_cells)
         inward = np.minimum(across, across[::-1]) - self.rim
-        return np.minimum(inward[:, None], inward[None, :])
+        return np.asarray(np.minimum(inward[:, None], inward[None, :]))
 
     def code_mask(self) -> NDArray[np.bool_]:
         """Tell which cells of a tag with its rim belong to the code, (n, n)."""

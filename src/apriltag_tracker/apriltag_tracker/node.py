@@ -24,9 +24,8 @@ from apriltag_tracker.pipeline import (
     TrackerOptions,
     warm_up,
 )
-from apriltag_tracker.pose.node import LimbStateNode
+from apriltag_tracker.pose.node import LimbStateNode, camera_transform
 from apriltag_tracker.reports import NO_CALIBRATION, ImageWatch, draw_observation
-from apriltag_tracker.state_messages import camera_transform
 from apriltag_tracker.tag_map import TagMap
 from apriltag_tracker.watching import StampGaps
 from der_msgs.msg import TagDetection

@@ -12,9 +12,8 @@ from apriltag_tracker.camera import CameraPose, Intrinsics
 from apriltag_tracker.detection import Detector, Tag
 from apriltag_tracker.detection.tracking import FULL_SEARCH_PERIOD, TagTracker
 from apriltag_tracker.pose.following import FollowerOptions, LimbFollower, survey_errors
-from apriltag_tracker.pose.plane import locate, pose_moves
 from apriltag_tracker.pose.shape import LimbEstimate, PlanarTag, centreline_pose
-from apriltag_tracker.pose.world import WorldPose
+from apriltag_tracker.pose.world import WorldPose, locate
 from apriltag_tracker.tag_map import LimbTag, TagMap, WorldTag
 
 
@@ -133,7 +132,7 @@ class LimbTracker:
             placed = tuple(PlacedTag(tag, tag.id in self._limb_tags, None) for tag in found)
             return placed, [], np.empty((0, 3, 0)), np.empty((0, 3, 0))
         flat = np.array([self._flat[tag.id] for tag in found])
-        places, spreads, misfits = locate(
+        places, spreads, misfits, moves = locate(
             np.array([tag.corners for tag in found]),
             np.array([tag.covariance for tag in found]),
             flat[:, 0],
@@ -156,9 +155,8 @@ class LimbTracker:
             PlacedTag(tag, tag.id in self._limb_tags, place)
             for tag, place in zip(found, places, strict=True)
         )
-        noise = pose_moves(places[used], flat[used, 0], flat[used, 1], pose)
         root = np.linalg.cholesky(self.world.covariance + 1e-18 * np.eye(6))
-        return everywhere, planar, common, noise @ root
+        return everywhere, planar, common, moves[used] @ root
 
     def _common_errors(
         self, places: NDArray[np.float64], heights: NDArray[np.float64], pose: CameraPose

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -65,21 +66,40 @@ class WorldTag:
 
 
 @dataclass(frozen=True)
-class TagMap:
-    """All tags of a set-up.
+class LimbGeometry(ABC):
+    """What a map says of the limb, whatever sits on it.
 
     Attributes:
-        segment_lengths: of the limb [m].
-        limb: tags on it.
-        world: fixed tags.
-        stiff: stretches of the limb that cannot bend, from and to in arc length [m].
-        family: of all tags.
+        segment_lengths: of the limb at rest [m].
+        stiff: stretches that cannot bend, from and to in arc length [m].
     """
 
     segment_lengths: tuple[float, ...]
+    stiff: tuple[tuple[float, float], ...] = field(default=(), kw_only=True)
+
+    @property
+    def length(self) -> float:
+        """Arc length of the tip at rest [m]."""
+        return sum(self.segment_lengths)
+
+    @property
+    @abstractmethod
+    def limb_names(self) -> dict[int, str]:
+        """Names of what is on the limb, by id, in the order of the map."""
+
+
+@dataclass(frozen=True)
+class TagMap(LimbGeometry):
+    """All tags of a set-up.
+
+    Attributes:
+        limb: tags on it.
+        world: fixed tags.
+        family: of all tags.
+    """
+
     limb: tuple[LimbTag, ...]
     world: tuple[WorldTag, ...]
-    stiff: tuple[tuple[float, float], ...] = ()
     family: Family = TAG36H11
 
     def __post_init__(self) -> None:
@@ -98,11 +118,6 @@ class TagMap:
     def limb_names(self) -> dict[int, str]:
         """Names of the limb's tags by their ids."""
         return {tag.id: str(tag.id) for tag in self.limb}
-
-    @property
-    def length(self) -> float:
-        """Arc length of the tip at rest [m]."""
-        return sum(self.segment_lengths)
 
     def world_tag(self, tag: int) -> WorldTag | None:
         """Return the world tag with this id, or None."""
@@ -144,7 +159,7 @@ class TagMap:
         if not limb_tags:
             raise MapError("limb.tags is empty: at least one tag must be on the limb")
         world_tags = tuple(_world_tag(entry, family) for entry in world.get("tags") or [])
-        return cls(lengths, limb_tags, world_tags, stiff, family)
+        return cls(lengths, limb_tags, world_tags, family, stiff=stiff)
 
 
 _Map = TypeVar("_Map")

@@ -7,9 +7,14 @@ import dataclasses
 import numpy as np
 import pytest
 
-from apriltag_tracker.bodies.base import PlaneWatch, fit_frame
 from apriltag_tracker.bodies.body_map import BodyMap
-from apriltag_tracker.bodies.tracker import BodyNoise, BodyTracker, FrameAssembler
+from apriltag_tracker.bodies.tracker import (
+    BodyNoise,
+    BodyTracker,
+    FrameAssembler,
+    PlaneWatch,
+    fit_frame,
+)
 from apriltag_tracker.pose.following import FollowerOptions, Uncertainty
 from apriltag_tracker.synthetic.poses import MocapFaults, SyntheticMocap
 from apriltag_tracker.tag_map import MapError

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from apriltag_tracker.camera import CameraPose, project
-from apriltag_tracker.pose.plane import locate, planar_poses
 from apriltag_tracker.pose.shape import centreline_pose
+from apriltag_tracker.pose.world import locate, planar_poses
 from apriltag_tracker.tag_map import UNIT_CORNERS, LimbTag
 
 
@@ -53,7 +53,7 @@ def test_tags_are_placed_at_their_height(model):
         for place, size, height in zip(places, sizes, heights, strict=True)
     ]
     noise = np.array([np.eye(8) * 0.02**2] * 2)
-    found, _, misfits = locate(np.array(corners), noise, heights, sizes, model.intrinsics, pose)
+    found, _, misfits, _ = locate(np.array(corners), noise, heights, sizes, model.intrinsics, pose)
     assert np.allclose(found, places, atol=1e-9)
     assert misfits.max() < 1e-9
 

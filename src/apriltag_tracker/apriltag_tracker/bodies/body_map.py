@@ -10,7 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from apriltag_tracker.tag_map import MapError, floats, limb_geometry, on_limb, read_map, section
+from apriltag_tracker.tag_map import (
+    LimbGeometry,
+    MapError,
+    floats,
+    limb_geometry,
+    on_limb,
+    read_map,
+    section,
+)
 
 SCHEMA_VERSION = 1
 LENGTH_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
@@ -78,25 +86,21 @@ class BaseFrame:
 
 
 @dataclass(frozen=True)
-class BodyMap:
+class BodyMap(LimbGeometry):
     """All bodies of a set-up.
 
     Attributes:
-        segment_lengths: of the limb [m].
         limb: bodies on it.
         fixed: bodies on the clamp and around the limb.
         names: of all bodies in the order in which the file lists them, which is that of a message
             without names.
-        stiff: stretches of the limb that cannot bend, from and to in arc length [m].
         unit: [m] of a unit of length of the poses.
         frame: where `limb_base` is, for a set-up without enough fixed bodies; None: from these.
     """
 
-    segment_lengths: tuple[float, ...]
     limb: tuple[BodyOnLimb, ...]
     fixed: tuple[FixedBody, ...]
     names: tuple[str, ...]
-    stiff: tuple[tuple[float, float], ...] = ()
     unit: float = 1.0
     frame: BaseFrame | None = None
 
@@ -104,11 +108,6 @@ class BodyMap:
     def limb_names(self) -> dict[int, str]:
         """Names of the limb's bodies by their ids, which are their places in ``limb``."""
         return {place: body.name for place, body in enumerate(self.limb)}
-
-    @property
-    def length(self) -> float:
-        """Arc length of the tip at rest [m]."""
-        return sum(self.segment_lengths)
 
     @classmethod
     def from_yaml(cls, path: str | Path) -> BodyMap:
@@ -149,7 +148,7 @@ class BodyMap:
                 "bodies: at least one must have 'place: clamp' or 'place: world', or the key frame "
                 "must say where limb_base is"
             )
-        return cls(lengths, limb, fixed, names, stiff, LENGTH_UNITS[unit], frame)
+        return cls(lengths, limb, fixed, names, LENGTH_UNITS[unit], frame, stiff=stiff)
 
 
 def _body(entry: Any, total: float) -> BodyOnLimb | FixedBody:

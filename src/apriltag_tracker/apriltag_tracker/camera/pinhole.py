@@ -88,22 +88,6 @@ def distort_to_pixels(
     return out
 
 
-@njit(cache=True)
-def ray_map(
-    width: int, height: int, matrix: NDArray[np.float64], d: NDArray[np.float64]
-) -> NDArray[np.float32]:
-    """Return the normalised coordinates of every pixel's centre, (height, width, 2)."""
-    out = np.empty((height, width, 2), dtype=np.float32)
-    for row in range(height):
-        yd = (row - matrix[1, 2]) / matrix[1, 1]
-        for column in range(width):
-            xd = (column - matrix[0, 2] - matrix[0, 1] * yd) / matrix[0, 0]
-            x, y = undistort(xd, yd, d)
-            out[row, column, 0] = x
-            out[row, column, 1] = y
-    return out
-
-
 @dataclass(frozen=True)
 class Intrinsics:
     """Calibration of a camera.

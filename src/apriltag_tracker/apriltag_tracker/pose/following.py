@@ -6,7 +6,7 @@ The pictures' bodies may be tags of a camera or rigid bodies of a motion capture
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from apriltag_tracker.pose.shape import (
     LimbEstimate,
-    LimbGeometry,
     PlanarTag,
     ShapeFitter,
     ShapePrior,
 )
+from apriltag_tracker.tag_map import LimbGeometry
 
 
 @dataclass(frozen=True)
@@ -191,23 +191,17 @@ class LimbFollower:
             return Followed(None, cause)
         (before, old), (last, new) = self._history
         share = (stamp - last) / (last - before)
+        going = ("tip", "tip_heading", "bend_angle", "curvature", "curve")
+        gone = {name: share * (getattr(new, name) - getattr(old, name)) for name in going}
         # How wrong the continuation can be: as far as the limb went meanwhile, and a millimetre.
-        slip = (new.tip - old.tip) * share
-        growth = np.outer(slip, slip) + 1e-6 * np.eye(2)
-        estimate = LimbEstimate(
-            tip=new.tip + slip,
+        growth = np.outer(gone["tip"], gone["tip"]) + 1e-6 * np.eye(2)
+        estimate = replace(
+            new,
+            **{name: getattr(new, name) + way for name, way in gone.items()},
             tip_covariance=new.tip_covariance + growth,
-            tip_systematic=new.tip_systematic,
-            tip_heading=new.tip_heading + (new.tip_heading - old.tip_heading) * share,
-            bend_angle=new.bend_angle + (new.bend_angle - old.bend_angle) * share,
-            bend_angle_sigma=new.bend_angle_sigma
-            + np.abs(new.bend_angle - old.bend_angle) * share
-            + 0.01,
-            curvature=new.curvature + (new.curvature - old.curvature) * share,
-            elongation=new.elongation,
-            residual=new.residual,
-            curve=new.curve + (new.curve - old.curve) * share,
+            bend_angle_sigma=new.bend_angle_sigma + np.abs(gone["bend_angle"]) + 0.01,
             tags_used=(),
+            rejected={},
         )
         frames = "frame" if self._bridged == 1 else "frames"
         return Followed(estimate, f"bridged {self._bridged} {frames}: {cause}", bridged=True)

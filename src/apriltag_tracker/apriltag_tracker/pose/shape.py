@@ -10,32 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apriltag_tracker.pose.curve import PLACE, Curve, CurveFit, Evaluation, fit_curve
-
-
-class LimbGeometry(Protocol):
-    """What the fit knows of the limb: a map of tags or of bodies says it."""
-
-    @property
-    def segment_lengths(self) -> tuple[float, ...]:
-        """Of the limb at rest [m]."""
-
-    @property
-    def stiff(self) -> tuple[tuple[float, float], ...]:
-        """Stretches that cannot bend, from and to in arc length [m]."""
-
-    @property
-    def length(self) -> float:
-        """Arc length of the tip at rest [m]."""
-
-    @property
-    def limb_names(self) -> dict[int, str]:
-        """Names of what is on the limb, by id, in the order of the map."""
+from apriltag_tracker.tag_map import LimbGeometry
 
 
 @dataclass(frozen=True)

@@ -1,16 +1,21 @@
-"""The camera's pose from the fixed tags, averaged while nothing moves and watched for bumps."""
+"""The camera's pose from the fixed tags, and what it makes of corners: places on the tags' planes.
+
+The pose is averaged while nothing moves and watched for bumps; the noise is carried along.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from apriltag_tracker.camera import CameraError, CameraPose, Intrinsics, solve_pose
 from apriltag_tracker.detection import Tag
-from apriltag_tracker.tag_map import TagMap, WorldTag
+from apriltag_tracker.tag_map import UNIT_CORNERS, TagMap, WorldTag
 
 _MEMORY = 150
 """Pictures over which corners are averaged."""
@@ -152,24 +157,12 @@ class WorldPose:
     ) -> NDArray[np.float64]:
         """Carry the noise of the averaged corners over to the pose that fits them best, (6, 6)."""
         seen = points @ pose.rotation.T + pose.translation
-        slopes = np.zeros((len(points), 2, 6))
-        depth = seen[:, 2]
-        for axis in range(2):
-            # The lens bends little across a tag: the focal length is the slope of the pixels.
-            per_metre = self._intrinsics.matrix[axis, axis] / depth
-            by_point = np.zeros((len(points), 3))
-            by_point[:, axis] = per_metre
-            by_point[:, 2] = -per_metre * seen[:, axis] / depth
-            slopes[:, axis, :3] = np.cross(seen, by_point)
-            slopes[:, axis, 3:] = by_point
-        rows = slopes.reshape(-1, 6)
-        gain = np.linalg.pinv(rows)
-        result = np.zeros((6, 6))
-        for k, tag in enumerate(ids):
-            known = self._seen[tag]
-            spread = known.noise + LASTING_ERROR**2 * np.eye(8)
-            part = gain[:, 8 * k : 8 * k + 8]
-            result += part @ spread @ part.T
+        lens, still = self._intrinsics, np.zeros(3)
+        _, slopes = cv2.projectPoints(seen, still, still, lens.matrix, lens.distortion)
+        # Of a point in the camera's frame, the first six are by a turn and a shift there.
+        parts = np.linalg.pinv(slopes[:, :6]).reshape(6, -1, 8).swapaxes(0, 1)
+        spreads = np.array([self._seen[tag].noise for tag in ids]) + LASTING_ERROR**2 * np.eye(8)
+        result: NDArray[np.float64] = (parts @ spreads @ parts.swapaxes(1, 2)).sum(axis=0)
         return result
 
     def _best_without(self, ids: Sequence[int], entries: dict[int, WorldTag]) -> int:
@@ -184,3 +177,92 @@ class WorldPose:
             except CameraError:
                 costs.append(np.inf)
         return int(np.argmin(costs))
+
+
+def planar_poses(
+    corners: NDArray[np.float64], sizes: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Fit squares of known sizes to four points of a plane each (Kabsch 1976, in the plane).
+
+    Args:
+        corners: (n, 4, 2) m, from the printed lower left counter-clockwise.
+        sizes: (n,) m, edges of the squares.
+
+    Returns:
+        x, y [m] and yaw [rad], (n, 3); their derivatives (n, 3, 8) by the corners x0 y0 x1 …; and
+        the RMS distance (n,) of the corners from the square [m].
+    """
+    centres = corners.mean(axis=1)
+    off = corners - centres[:, None]
+    u, v = np.moveaxis(sizes[:, None, None] * UNIT_CORNERS, 2, 0)
+    cosine = np.sum(u * off[:, :, 0] + v * off[:, :, 1], axis=1)[:, None]
+    sine = np.sum(u * off[:, :, 1] - v * off[:, :, 0], axis=1)[:, None]
+    norm = np.hypot(cosine, sine)
+    turned = np.stack([cosine * u - sine * v, sine * u + cosine * v], axis=2) / norm[:, :, None]
+    misfits = np.sqrt(np.mean(np.sum((off - turned) ** 2, axis=2), axis=1))
+    slopes = np.zeros((len(corners), 3, 8))
+    slopes[:, 0, 0::2] = slopes[:, 1, 1::2] = 0.25
+    # The square's own centre is zero, so the mean of the corners does not enter the angle.
+    slopes[:, 2, 0::2] = (-cosine * v - sine * u) / norm**2
+    slopes[:, 2, 1::2] = (cosine * u - sine * v) / norm**2
+    return np.column_stack([centres, np.arctan2(sine, cosine)]), slopes, misfits
+
+
+class Located(NamedTuple):
+    """Where n tags are on their planes.
+
+    Attributes:
+        places: (n, 3) x, y [m], yaw [rad].
+        spreads: (n, 3, 3) their covariances from the noise of the corners.
+        misfits: (n,) RMS distance of the corners from a square of the tag's size [m].
+        moves: (n, 3, 6) derivatives of the places, while the pixels stay, by a turn [rad] and a
+            shift [m] of the camera's frame.
+    """
+
+    places: NDArray[np.float64]
+    spreads: NDArray[np.float64]
+    misfits: NDArray[np.float64]
+    moves: NDArray[np.float64]
+
+
+def locate(
+    corners: NDArray[np.float64],
+    covariances: NDArray[np.float64],
+    heights: NDArray[np.float64],
+    sizes: NDArray[np.float64],
+    intrinsics: Intrinsics,
+    pose: CameraPose,
+) -> Located:
+    """Place tags that lie flat at known heights.
+
+    A point X of the camera's frame that turns by ω and shifts by τ goes to X + ω × X + τ; what the
+    pixel shows on the plane moves so that the ray stays.
+
+    Args:
+        corners: (n, 4, 2) px.
+        covariances: (n, 8, 8) px² of the corners.
+        heights: (n,) m above the base plane.
+        sizes: (n,) m, edges of the black borders.
+        intrinsics: of the camera.
+        pose: of the camera.
+    """
+    rotation, origin = pose.rotation, pose.position
+    rays = intrinsics.rays(corners.reshape(-1, 2)).reshape(-1, 4, 2)
+    directions = rays @ rotation[:2] + rotation[2]
+    across, down = directions[:, :, :2], directions[:, :, 2:]
+    gap = (heights - origin[2])[:, None, None]
+    places, slopes, misfits = planar_poses(origin[:2] + gap * across / down, sizes)
+    # The lens bends little across a tag: the focal length is the slope of the rays.
+    focal = np.diag(intrinsics.matrix)[:2]
+    changes = rotation[:2, :2].T * down[:, :, :, None] - across[:, :, :, None] * rotation[:2, 2]
+    changes *= gap[:, :, :, None] / down[:, :, :, None] ** 2 / focal
+    by_corner = slopes.reshape(-1, 3, 4, 2)
+    gain = np.einsum("npkr,nkra->npka", by_corner, changes).reshape(-1, 3, 8)
+    seen = np.concatenate([rays, np.ones_like(down)], axis=2) * gap / down
+    shifts = np.empty((*seen.shape[:2], 6, 3))
+    shifts[:, :, :3] = np.cross(np.eye(3), seen[:, :, None])
+    shifts[:, :, 3:] = np.eye(3)
+    turned = shifts @ rotation
+    moves = (across / down)[:, :, None] * turned[..., 2:] - turned[..., :2]
+    moves = np.einsum("npkr,nkmr->npm", by_corner, moves)
+    return Located(places, gain @ covariances @ gain.transpose(0, 2, 1), misfits, moves)

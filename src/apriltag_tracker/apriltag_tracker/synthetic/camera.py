@@ -14,12 +14,10 @@ import yaml
 from numpy.typing import NDArray
 
 from apriltag_tracker.camera import CameraError, CameraPose, Intrinsics, project
-from apriltag_tracker.camera.pinhole import ray_map
 from apriltag_tracker.synthetic import render
 from apriltag_tracker.synthetic.shapes import (
     MOST_INSTANTS,
     PLACEMENT,
-    Centreline,
     Exposure,
     Mounts,
     Placements,
@@ -199,15 +197,7 @@ class SyntheticCamera:
         self, image: NDArray[np.uint8], shape: Shape, velocity: Shape | None
     ) -> dict[int, NDArray[np.float64]]:
         """Draw the limb's tags; returns the corners of those that are in the picture, by id."""
-        later = shape
-        if velocity is not None:
-            later = Shape(
-                shape.arc_length, shape.points + velocity.points, shape.heading + velocity.heading
-            )
-        limb = Centreline(
-            shape.arc_length, shape.points, shape.heading, later.points, later.heading
-        )
-        placed = place_tags(self._mounts, self._exposure, limb)
+        placed = place_tags(self._mounts, self._exposure, shape, velocity)
         return self._draw_tags(image, self.tags.limb, self._prints, self._noise, placed)
 
     def _draw_tags(
@@ -239,12 +229,14 @@ class SyntheticCamera:
     def _make_eye(self) -> render.Eye:
         """Return lens, place and light as the drawing takes them."""
         size, pose = self.model.intrinsics, self.model.pose
+        rows, columns = np.indices((size.height, size.width))
+        rays = size.rays(np.stack([columns, rows], axis=2)).reshape(*rows.shape, 2)
         return render.Eye(
             np.ascontiguousarray(pose.rotation),
             np.ascontiguousarray(pose.translation),
             size.matrix,
             size.distortion,
-            ray_map(size.width, size.height, size.matrix, size.distortion),
+            rays.astype(np.float32),
             self._make_light(),
             math.sqrt(self.optics.blur**2 + render.PIXEL_VARIANCE),
             self.optics.black,

@@ -81,22 +81,19 @@ class SyntheticMocap:
         if self._started is None:
             self._started = stamp
         faults, bodies = self.faults, self.bodies
-        fixed = {body.name: body for body in bodies.fixed}
-        limb = {body.name: body for body in bodies.limb}
         count = len(bodies.names)
         positions, axes = np.empty((count, 3)), np.empty((count, 3, 3))
-        for k, name in enumerate(bodies.names):
-            if name in fixed:
-                positions[k] = fixed[name].position
-                turned = fixed[name].rotation
-                axes[k] = np.eye(3) if turned is None else turned
-                continue
-            body = limb[name]
+        for fixed in bodies.fixed:
+            k = bodies.names.index(fixed.name)
+            positions[k] = fixed.position
+            axes[k] = np.eye(3) if fixed.rotation is None else fixed.rotation
+        for body in bodies.limb:
+            k = bodies.names.index(body.name)
             x, y, heading = shape.at(body.arc_length)
             along, across, turn = body.offset
-            about = Rotation.from_euler("z", heading).as_matrix()
-            positions[k] = np.array([x, y, body.height]) + about @ np.array([along, across, 0.0])
-            axes[k] = about @ Rotation.from_euler("z", turn).as_matrix() @ body.rotation
+            about = Rotation.from_euler("z", heading)
+            positions[k] = np.array([x, y, body.height]) + about.apply([along, across, 0.0])
+            axes[k] = (about * Rotation.from_euler("z", turn)).as_matrix() @ body.rotation
         positions = positions @ self.rotation.T + self.origin
         positions += faults.position_noise * self._random.standard_normal((count, 3))
         noise = faults.direction_noise * self._random.standard_normal((count, 3))

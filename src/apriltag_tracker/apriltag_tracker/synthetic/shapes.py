@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 PLACEMENT = 5
 """Numbers of a placed tag: x, y, z [m], yaw [rad], size [m]."""
@@ -28,9 +26,26 @@ class Shape:
     points: NDArray[np.float64]
     heading: NDArray[np.float64]
 
-    def at(self, arc_length: float) -> NDArray[np.float64]:
-        """Return x, y, heading at an arc length (cubic), continued as a line beyond."""
-        return np.array(place_at(self.arc_length, self.points, self.heading, arc_length))
+    def at(self, arc_length: ArrayLike) -> NDArray[np.float64]:
+        """Return x, y, heading (…, 3) at arc lengths (…) (cubic), continued as a line beyond."""
+        nodes = self.arc_length
+        inside = np.clip(arc_length, nodes[0], nodes[-1])
+        k = np.clip(np.searchsorted(nodes, inside) - 1, 0, len(nodes) - 2)
+        t = ((inside - nodes[k]) / (nodes[k + 1] - nodes[k]))[..., None]
+        # Hermite: the tangents are known, their length is that of the chord's arc.
+        chord, turned = self.points[k + 1] - self.points[k], self.heading[k + 1] - self.heading[k]
+        arc = (np.hypot(*np.moveaxis(chord, -1, 0)) * (1.0 + 0.25 * turned**2 / 6.0))[..., None]
+        heading = self.heading[k] + t[..., 0] * turned
+        place = self.points[k] + (3.0 * t**2 - 2.0 * t**3) * chord
+        place += arc * (t - 2.0 * t**2 + t**3) * _tangent(self.heading[k])
+        place += arc * (t**3 - t**2) * _tangent(self.heading[k + 1])
+        place += (np.asarray(arc_length) - inside)[..., None] * _tangent(heading)
+        return np.concatenate([place, heading[..., None]], axis=-1)
+
+
+def _tangent(heading: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the unit vectors (…, 2) of headings (…) rad."""
+    return np.stack([np.cos(heading), np.sin(heading)], axis=-1)
 
 
 def constant_curvature(
@@ -58,7 +73,7 @@ def _integrate(s: NDArray[np.float64], heading: NDArray[np.float64]) -> NDArray[
     step, turned = np.diff(s), np.diff(heading)
     middle = 0.5 * (heading[1:] + heading[:-1])
     chord = step * np.sinc(turned / (2.0 * np.pi))
-    moves = chord[:, None] * np.stack([np.cos(middle), np.sin(middle)], axis=1)
+    moves = chord[:, None] * _tangent(middle)
     return np.vstack([np.zeros(2), np.cumsum(moves, axis=0)])
 
 
@@ -76,6 +91,17 @@ class Mounts(NamedTuple):
     height: NDArray[np.float64]
     size: NDArray[np.float64]
     offset: NDArray[np.float64]
+
+    def placed(self, poses: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the placements (n, k, 5) of the tags where the centreline has poses (n, k, 3)."""
+        tangent, (along, across, turn) = _tangent(poses[..., 2]), self.offset.T[:, :, None, None]
+        result = np.empty((*poses.shape[:2], PLACEMENT))
+        result[..., :2] = poses[..., :2] + along * tangent
+        result[..., :2] += across * tangent[..., ::-1] * [-1.0, 1.0]
+        result[..., 2] = self.height[:, None]
+        result[..., 3] = poses[..., 2] + turn[..., 0]
+        result[..., 4] = self.size[:, None]
+        return result
 
 
 class Exposure(NamedTuple):
@@ -103,65 +129,6 @@ class Exposure(NamedTuple):
         return cls(0.5 * time, scale, instants, shares)
 
 
-@njit(cache=True)
-def place_at(
-    arc_length: NDArray[np.float64],
-    points: NDArray[np.float64],
-    heading: NDArray[np.float64],
-    at: float,
-) -> tuple[float, float, float]:
-    """Return x, y, heading of a centreline at an arc length (cubic), beyond it of its tangent."""
-    k = min(max(int(np.searchsorted(arc_length, at)) - 1, 0), len(arc_length) - 2)
-    t = (at - arc_length[k]) / (arc_length[k + 1] - arc_length[k])
-    if t < 0.0 or t > 1.0:
-        end = 0 if t < 0.0 else len(arc_length) - 1
-        reach, angle = at - arc_length[end], heading[end]
-        x, y = points[end, 0] + reach * math.cos(angle), points[end, 1] + reach * math.sin(angle)
-        return x, y, angle
-    # Hermite: the tangents are known, their length is that of the chord's arc.
-    turned = heading[k + 1] - heading[k]
-    chord_x, chord_y = points[k + 1, 0] - points[k, 0], points[k + 1, 1] - points[k, 1]
-    arc = math.hypot(chord_x, chord_y) * (1.0 + 0.25 * turned * turned / 6.0)
-    along = 3.0 * t**2 - 2.0 * t**3
-    first, second = arc * (t - 2.0 * t**2 + t**3), arc * (t**3 - t**2)
-    x = points[k, 0] + along * chord_x
-    x += first * math.cos(heading[k]) + second * math.cos(heading[k + 1])
-    y = points[k, 1] + along * chord_y
-    y += first * math.sin(heading[k]) + second * math.sin(heading[k + 1])
-    return x, y, heading[k] + t * turned
-
-
-@njit(cache=True)
-def _write_placement(
-    mounts: Mounts, tag: int, x: float, y: float, angle: float, placement: NDArray[np.float64]
-) -> None:
-    """Write the placement (5,) of a tag whose centreline is at x, y, angle."""
-    offset, cosine, sine = mounts.offset[tag], math.cos(angle), math.sin(angle)
-    placement[0] = x + cosine * offset[0] - sine * offset[1]
-    placement[1] = y + sine * offset[0] + cosine * offset[1]
-    placement[2] = mounts.height[tag]
-    placement[3] = angle + offset[2]
-    placement[4] = mounts.size[tag]
-
-
-class Centreline(NamedTuple):
-    """A limb in the middle of an exposure, and a second later at its present velocity.
-
-    Attributes:
-        arc_length: (m,) m.
-        points: (m, 2) m.
-        heading: (m,) rad.
-        later_points: (m, 2) m.
-        later_heading: (m,) rad.
-    """
-
-    arc_length: NDArray[np.float64]
-    points: NDArray[np.float64]
-    heading: NDArray[np.float64]
-    later_points: NDArray[np.float64]
-    later_heading: NDArray[np.float64]
-
-
 class Placements(NamedTuple):
     """Where n tags are during an exposure.
 
@@ -176,30 +143,26 @@ class Placements(NamedTuple):
     counts: NDArray[np.int64]
 
 
-@njit(cache=True)
-def place_tags(mounts: Mounts, exposure: Exposure, limb: Centreline) -> Placements:
-    """Place the tags of a limb that moves during an exposure."""
-    tags = len(mounts.size)
-    middle, counts = np.empty((tags, PLACEMENT)), np.empty(tags, dtype=np.int64)
-    placements = np.empty((tags, MOST_INSTANTS, PLACEMENT))
-    for tag in range(tags):
-        at = mounts.arc_length[tag]
-        x, y, angle = place_at(limb.arc_length, limb.points, limb.heading, at)
-        _write_placement(mounts, tag, x, y, angle, middle[tag])
-        later = place_at(limb.arc_length, limb.later_points, limb.later_heading, at)
-        by_x, by_y, by_angle = later[0] - x, later[1] - y, later[2] - angle
-        speed = math.hypot(by_x, by_y) + abs(by_angle) * mounts.size[tag]
-        travelled = 2.0 * exposure.half * exposure.scale * speed
-        if travelled < _STILL:
-            counts[tag] = 1
-            placements[tag, 0] = middle[tag]
-            continue
-        count = min(1 + math.ceil(travelled / _INSTANTS_APART), MOST_INSTANTS)
-        counts[tag] = count
-        for k in range(count):
-            time = exposure.half * exposure.instants[count - 1, k]
-            _write_placement(
-                mounts, tag, x + time * by_x, y + time * by_y, angle + time * by_angle,
-                placements[tag, k],
-            )  # fmt: skip
-    return Placements(middle, placements, counts)
+def place_tags(
+    mounts: Mounts, exposure: Exposure, shape: Shape, velocity: Shape | None = None
+) -> Placements:
+    """Place the tags of a limb that moves during an exposure.
+
+    Args:
+        mounts: of the tags.
+        exposure: of the picture.
+        shape: the limb in the middle of it.
+        velocity: its change in a second, in the same arrays; None: it rests.
+    """
+    middle = shape.at(mounts.arc_length)
+    change = np.zeros_like(middle)
+    if velocity is not None:
+        points, heading = shape.points + velocity.points, shape.heading + velocity.heading
+        change = Shape(shape.arc_length, points, heading).at(mounts.arc_length) - middle
+    speed = np.hypot(change[:, 0], change[:, 1]) + np.abs(change[:, 2]) * mounts.size
+    travelled = 2.0 * exposure.half * exposure.scale * speed
+    steps = np.minimum(1.0 + np.ceil(travelled / _INSTANTS_APART), MOST_INSTANTS)
+    counts = np.where(travelled < _STILL, 1, steps.astype(np.int64))
+    times = exposure.half * exposure.instants[counts - 1]
+    during = middle[:, None] + times[:, :, None] * change[:, None]
+    return Placements(mounts.placed(middle[:, None])[:, 0], mounts.placed(during), counts)

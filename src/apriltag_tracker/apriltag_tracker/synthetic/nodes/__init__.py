@@ -1,1 +1,78 @@
-"""Nodes that show the shape of the twin."""
+"""Nodes that show the shape of the twin. They share that they listen to it, and say how it goes."""
+
+from __future__ import annotations
+
+import time
+from abc import abstractmethod
+
+import numpy as np
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+
+from apriltag_tracker.synthetic.shapes import Shape
+from der_msgs.msg import LimbShape
+from limb_interfaces import stamps, topics
+from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
+from limb_interfaces.parameters import declare
+
+
+class ShapeListener(Node):
+    """Takes the shapes of the twin.
+
+    Args:
+        name: of the node.
+    """
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name, namespace=topics.NAMESPACE)
+        self._frames = self._refused = 0
+        self._last_shape = time.monotonic()
+        self._busy = 0.0
+
+    def number(
+        self, name: str, default: float, description: str, at_most: float, at_least: float = 0.0
+    ) -> float:
+        """Declare a number."""
+        bounds = {"at_least": at_least, "at_most": at_most}
+        return float(declare(self, name, float(default), description, **bounds))
+
+    def listen(self, hardware: str, profile: QoSProfile) -> None:
+        """Begin, once everything is ready; ``hardware`` names in the diagnostics what it is."""
+        self.create_subscription(LimbShape, topics.TWIN_SHAPE, self._on_shape, profile)
+        self._diagnostics = DiagnosticsPublisher(self, self._health, hardware)
+
+    @abstractmethod
+    def show(self, stamp: int, shape: Shape) -> None:
+        """Publish what is to be seen of a shape at an instant [ns]."""
+
+    def _on_shape(self, message: LimbShape) -> None:
+        started = time.perf_counter()
+        self._last_shape = time.monotonic()
+        points = np.array([(point.x, point.y) for point in message.points]).reshape(-1, 2)
+        shape = Shape(np.array(message.arc_length), points, np.array(message.heading))
+        if (
+            len(points) < 2
+            or not len(points) == len(shape.arc_length) == len(shape.heading)
+            or not (np.isfinite(points).all() and np.all(np.diff(shape.arc_length) > 0.0))
+        ):
+            self._refused += 1
+            return
+        self.show(stamps.nanoseconds(message.header.stamp), shape)
+        self._frames += 1
+        self._busy += time.perf_counter() - started
+
+    def _health(self) -> Health:
+        silent = time.monotonic() - self._last_shape
+        values = {
+            "frames": self._frames,
+            "refused_shapes": self._refused,
+            "render_ms": f"{1e3 * self._busy / max(self._frames, 1):.2f}",
+        }
+        if self._frames == 0:
+            return Health("stale", f"waiting for shapes on {topics.TWIN_SHAPE}", values)
+        if silent > 1.0:
+            said = f"no shape on {topics.TWIN_SHAPE} for {silent:.0f} s: is limb_twin running?"
+            return Health("warning", said, values)
+        if self._refused:
+            return Health("warning", f"{self._refused} malformed shapes were left out", values)
+        return Health("ok", "rendering", values)

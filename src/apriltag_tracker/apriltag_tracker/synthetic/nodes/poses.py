@@ -12,7 +12,7 @@ from geometry_msgs.msg import Pose, PoseArray, PoseStamped
 
 from apriltag_tracker.bodies.body_map import BodyMap
 from apriltag_tracker.bodies.forms import message_type, topics_of
-from apriltag_tracker.synthetic.nodes.listening import ShapeListener
+from apriltag_tracker.synthetic.nodes import ShapeListener
 from apriltag_tracker.synthetic.poses import UPRIGHT, MocapFaults, SyntheticMocap
 from apriltag_tracker.synthetic.shapes import Shape
 from limb_interfaces import qos, stamps

@@ -18,7 +18,7 @@ from apriltag_tracker.synthetic.camera import (
     Optics,
     SyntheticCamera,
 )
-from apriltag_tracker.synthetic.nodes.listening import ShapeListener
+from apriltag_tracker.synthetic.nodes import ShapeListener
 from apriltag_tracker.synthetic.shapes import Shape, constant_curvature
 from apriltag_tracker.tag_map import TagMap
 from limb_interfaces import qos, stamps, topics
