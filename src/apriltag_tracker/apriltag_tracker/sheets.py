@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -190,20 +190,17 @@ def _add_tag(
     page.labels.append((x, y + sheet + 8.0, 2.6, "right-hand side: along the limb, or along x"))
 
 
-def _black_rectangles(black: NDArray[np.bool_]) -> list[tuple[int, int, int, int]]:
-    """Cover the true cells of a grid by rectangles: runs of a row, joined downward."""
-    open_runs: dict[tuple[int, int], int] = {}
-    result = []
-    for row in range(black.shape[0] + 1):
-        line = black[row] if row < black.shape[0] else np.zeros(black.shape[1], dtype=bool)
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], line.astype(np.int8), [0]])))
-        runs = {(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)}
-        for run in [run for run in open_runs if run not in runs]:
-            top = open_runs.pop(run)
-            result.append((run[0], top, run[1] - run[0], row - top))
-        for run in runs:
-            open_runs.setdefault(run, row)
-    return result
+def _black_rectangles(black: NDArray[np.bool_]) -> Iterable[tuple[int, int, int, int]]:
+    """Cover the true cells of a grid by rectangles (column, row, width, height).
+
+    They are the runs of each band of equal rows.
+    """
+    tops = np.flatnonzero(np.diff(black, axis=0, prepend=~black[:1]).any(axis=1))
+    heights = np.diff(tops, append=len(black))
+    bands, edges = np.nonzero(np.diff(np.pad(black[tops], ((0, 0), (1, 1)))))
+    begins, widths, bands = edges[::2], edges[1::2] - edges[::2], bands[::2]
+    columns = (begins, tops[bands], widths, heights[bands])
+    return zip(*(column.tolist() for column in columns), strict=True)
 
 
 def drawing(page: Page) -> Figure:

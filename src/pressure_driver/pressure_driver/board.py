@@ -200,7 +200,7 @@ class BoardProcess:
         """Vent before the next tick, and before all that waits to be sent."""
         answer = self.core.vent()
         self._drop_unsent()
-        self._write(self.core.emergency())
+        self._write(self.core.protocol.emergency())
         return answer
 
     def _show_life(self) -> None:
@@ -227,7 +227,7 @@ class BoardProcess:
         self._write(self.core.opening())
         if self._line is not None:
             descriptor = self._line.fileno() if self._line.shared else None
-            self._send("port", self.core.emergency().hex(), descriptor=descriptor)
+            self._send("port", self.core.protocol.emergency().hex(), descriptor=descriptor)
 
     def _look_for_port(self) -> None:
         """Open a port that was lost as soon as its name is there again."""
@@ -331,7 +331,7 @@ class BoardProcess:
             with contextlib.suppress(OSError, ValueError):
                 self._line = open_line(self._port, self._baud_rate)
         descriptor = -1 if self._line is None else self._line.fileno()
-        problem = vent_line(descriptor, self.core.emergency(), duration)
+        problem = vent_line(descriptor, self.core.protocol.emergency(), duration)
         self._release(drop=bool(problem))
         return problem
 

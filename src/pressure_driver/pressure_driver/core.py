@@ -278,10 +278,6 @@ class DriverCore:
         if self._texts:
             self._log(f"board: {self._texts.popleft()}", False)
 
-    def emergency(self) -> bytes:
-        """Return the vent command, complete after any half-sent bytes."""
-        return self.protocol.emergency()
-
     def _wire_atmosphere(self) -> float:
         return self.monitor.rest.mean if self.monitor.rest.known else STANDARD_ATMOSPHERE
 

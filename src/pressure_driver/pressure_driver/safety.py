@@ -196,10 +196,6 @@ class SafetyMachine:
         self._spent.hear(plan, now)
         return self.schedule.offer(setpoint, wall, self.differential)
 
-    def fail(self, reason: str) -> None:
-        """Go to FAULT for a reason from outside (the line, the board's own report)."""
-        self._fault([reason])
-
     def _lose_operator(self, source: str, now: float) -> None:
         """Hold, let down or vent as `on_lost_operator` says, until DISARMED; take nothing more."""
         if self.mode not in LIVE or self._latched:
@@ -321,10 +317,13 @@ class SafetyMachine:
             if condition.always or (condition.lasting and self.mode is not Mode.DISARMED)
         ]
         if found:
-            self._fault(found)
+            self.fail(*found)
 
-    def _fault(self, reasons: list[str]) -> None:
-        """Vent; a reason that differs from one already known only in its numbers is not added."""
+    def fail(self, *reasons: str) -> None:
+        """Go to FAULT and vent.
+
+        A reason that differs from one already known only in its numbers is not added.
+        """
         known = {_subject(reason) for reason in self.faults}
         for reason in reasons:
             if _subject(reason) not in known and len(self.faults) < MOST_FAULTS:

@@ -12,32 +12,50 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-_TO_GREY = {
-    "bgr8": cv2.COLOR_BGR2GRAY,
-    "rgb8": cv2.COLOR_RGB2GRAY,
-    "bgra8": cv2.COLOR_BGRA2GRAY,
-    "rgba8": cv2.COLOR_RGBA2GRAY,
-}
-_YUV_TO_GREY = {"yuv422_yuy2": 0, "yuyv": 0, "yuv422": 1, "uyvy": 1}
-_PLANAR = ("nv12", "nv21")
-"""A plane of brightness with half as many rows of colour below it, which are not read."""
+
+class _Encoding(NamedTuple):
+    """How the pixels of an image message become grey.
+
+    Attributes:
+        width: bytes of a pixel.
+        conversion: OpenCV's, None where the brightness is there.
+        first: byte of the first pixel's brightness.
+        wide: whether a pixel is a word of 16 bits.
+    """
+
+    width: int
+    conversion: int | None = None
+    first: int = 0
+    wide: bool = False
+
 
 # A pattern is named by its first row in ROS and by its second row, second column on, in OpenCV.
 _BAYER = {
-    "bayer_rggb8": cv2.COLOR_BayerBG2GRAY,
-    "bayer_bggr8": cv2.COLOR_BayerRG2GRAY,
-    "bayer_gbrg8": cv2.COLOR_BayerGR2GRAY,
-    "bayer_grbg8": cv2.COLOR_BayerGB2GRAY,
+    "bayer_rggb": cv2.COLOR_BayerBG2GRAY,
+    "bayer_bggr": cv2.COLOR_BayerRG2GRAY,
+    "bayer_gbrg": cv2.COLOR_BayerGR2GRAY,
+    "bayer_grbg": cv2.COLOR_BayerGB2GRAY,
 }
-_BAYER_16 = {f"{name[:-1]}16": code for name, code in _BAYER.items()}
-_MONO_16 = ("mono16", "16UC1")
-KNOWN = ("mono8", "8UC1", *_MONO_16, *_TO_GREY, *_YUV_TO_GREY, *_PLANAR, *_BAYER, *_BAYER_16)
+_ENCODINGS = {
+    **dict.fromkeys(("mono8", "8UC1"), _Encoding(1)),
+    **dict.fromkeys(("mono16", "16UC1"), _Encoding(2, wide=True)),
+    "bgr8": _Encoding(3, cv2.COLOR_BGR2GRAY),
+    "rgb8": _Encoding(3, cv2.COLOR_RGB2GRAY),
+    "bgra8": _Encoding(4, cv2.COLOR_BGRA2GRAY),
+    "rgba8": _Encoding(4, cv2.COLOR_RGBA2GRAY),
+    **dict.fromkeys(("yuv422_yuy2", "yuyv"), _Encoding(2)),
+    **dict.fromkeys(("yuv422", "uyvy"), _Encoding(2, first=1)),
+    # A plane of brightness with half as many rows of colour below it, which are not read.
+    **dict.fromkeys(("nv12", "nv21"), _Encoding(1)),
+    **{f"{name}8": _Encoding(1, code) for name, code in _BAYER.items()},
+    **{f"{name}16": _Encoding(2, code, wide=True) for name, code in _BAYER.items()},
+}
 
 PICTURES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm"}
 
@@ -79,26 +97,25 @@ class ImageReader:
         Raises:
             ImageError: unknown encoding, or fewer bytes than the size needs.
         """
-        channels, width_bytes = _layout(encoding)
+        if encoding not in _ENCODINGS:
+            raise ImageError(f"unknown encoding '{encoding}': {', '.join(_ENCODINGS)} are read")
+        known = _ENCODINGS[encoding]
+        row = width * known.width
         raw = np.frombuffer(data, dtype=np.uint8)
-        if height <= 0 or width <= 0 or step < width * width_bytes or raw.size < step * height:
+        if height <= 0 or width <= 0 or step < row or raw.size < step * height:
             raise ImageError(
                 f"image of {width} x {height} px in {encoding} with {step} bytes a row has "
-                f"{raw.size} bytes: {width * width_bytes} bytes a row or more expected"
+                f"{raw.size} bytes: {row} bytes a row or more expected"
             )
-        rows = raw[: step * height].reshape(height, step)[:, : width * width_bytes]
-        if encoding in {"mono8", "8UC1", *_PLANAR}:
-            return np.ascontiguousarray(rows)
-        if encoding in _YUV_TO_GREY:
-            return np.ascontiguousarray(rows[:, _YUV_TO_GREY[encoding] :: 2])
-        if encoding in {*_MONO_16, *_BAYER_16}:
-            words = np.ascontiguousarray(rows).view(">u2" if big_endian else "<u2")
-            grey = self._from_16_bits(words)
-            return _from_bayer(grey, _BAYER_16[encoding]) if encoding in _BAYER_16 else grey
-        if encoding in _BAYER:
-            return _from_bayer(np.ascontiguousarray(rows), _BAYER[encoding])
-        pixels = np.ascontiguousarray(rows).reshape(height, width, channels)
-        return np.asarray(cv2.cvtColor(pixels, _TO_GREY[encoding]), dtype=np.uint8)
+        pixels = np.ascontiguousarray(raw[: step * height].reshape(height, step)[:, :row])
+        if known.wide:
+            pixels = self._from_16_bits(pixels.view(">u2" if big_endian else "<u2"))
+        elif known.conversion is None:
+            return np.ascontiguousarray(pixels[:, known.first :: known.width])
+        if known.conversion is None:
+            return pixels
+        pixels = pixels.reshape(height, width, -1)
+        return np.asarray(cv2.cvtColor(pixels, known.conversion), dtype=np.uint8)
 
     def _from_16_bits(self, words: NDArray[Any]) -> NDArray[np.uint8]:
         """Return the upper 8 of as many bits as the camera has shown to use, 8 to 16."""
@@ -112,22 +129,6 @@ def to_grey(
 ) -> NDArray[np.uint8]:
     """Return the grey picture of one image message by itself, see `ImageReader.to_grey`."""
     return ImageReader().to_grey(data, height, width, step, encoding, big_endian)
-
-
-def _from_bayer(mosaic: NDArray[np.uint8], code: int) -> NDArray[np.uint8]:
-    return np.asarray(cv2.cvtColor(mosaic, code), dtype=np.uint8)
-
-
-def _layout(encoding: str) -> tuple[int, int]:
-    """Return channels and bytes of a pixel."""
-    if encoding in {"mono8", "8UC1", *_PLANAR, *_BAYER}:
-        return 1, 1
-    if encoding in {*_MONO_16, *_BAYER_16} or encoding in _YUV_TO_GREY:
-        return 1, 2
-    if encoding in _TO_GREY:
-        channels = 4 if "a" in encoding else 3
-        return channels, channels
-    raise ImageError(f"unknown encoding '{encoding}': {', '.join(KNOWN)} are read")
 
 
 def check_grey(image: Any) -> NDArray[np.uint8]:

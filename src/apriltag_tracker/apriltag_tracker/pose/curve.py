@@ -65,13 +65,12 @@ class Curve:
             half = 0.5 * self.active[j]
             local = np.clip((bending - starts[j]) / half - 1.0, -1.0, 1.0)
             basis[:, 4 + j] = half * (local + 1.0)
-            for degree in range(1, self.degrees + 1):
-                column = 4 + self.segments + j * self.degrees + degree - 1
-                # Integral of the Legendre polynomial from -1.
-                series = np.zeros(degree + 1)
-                series[degree] = 1.0
-                integral = np.polynomial.legendre.legint(series, lbnd=-1.0)
-                basis[:, column] = half * np.polynomial.legendre.legval(local, integral)
+            # The integral of the Legendre polynomial of degree n from -1 is that of degree n + 1
+            # less that of degree n - 1, over 2 n + 1.
+            legendre = np.polynomial.legendre.legvander(local, self.degrees + 1)
+            first, degrees = 4 + self.segments + j * self.degrees, np.arange(1, self.degrees + 1)
+            integrals = (legendre[:, 2:] - legendre[:, :-2]) / (2 * degrees + 1)
+            basis[:, first : first + self.degrees] = half * integrals
         return basis
 
     def quadrature(self, s: Sequence[float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -190,15 +190,10 @@ class SyntheticCamera:
         result = RenderedPicture(image, dict(self._world))
         if shape is not None:
             self._draw_body(image, shape)
-            result.corners.update(self._draw_limb_tags(image, shape, velocity))
+            placed = place_tags(self._mounts, self._exposure, shape, velocity)
+            drawn = self._draw_tags(image, self.tags.limb, self._prints, self._noise, placed)
+            result.corners.update(drawn)
         return result
-
-    def _draw_limb_tags(
-        self, image: NDArray[np.uint8], shape: Shape, velocity: Shape | None
-    ) -> dict[int, NDArray[np.float64]]:
-        """Draw the limb's tags; returns the corners of those that are in the picture, by id."""
-        placed = place_tags(self._mounts, self._exposure, shape, velocity)
-        return self._draw_tags(image, self.tags.limb, self._prints, self._noise, placed)
 
     def _draw_tags(
         self,

@@ -216,11 +216,8 @@ def _write_map(
     down = cell * (eye.rotation[:, 0] * sine - eye.rotation[:, 1] * cosine)
     origin = eye.rotation @ placement[:3] + eye.translation - half * (right + down)
     # Rows of the inverse of the matrix with these columns are their cross products, up to a factor.
-    for k in range(3):
-        after, last = (k + 1) % 3, (k + 2) % 3
-        result[k] = down[after] * origin[last] - down[last] * origin[after]
-        result[3 + k] = origin[after] * right[last] - origin[last] * right[after]
-        result[6 + k] = right[after] * down[last] - right[last] * down[after]
+    result[:3], result[3:6] = np.cross(down, origin), np.cross(origin, right)
+    result[6:] = np.cross(right, down)
 
 
 @njit(cache=True)

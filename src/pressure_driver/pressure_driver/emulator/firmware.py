@@ -11,11 +11,7 @@ from pressure_driver.emulator import BoardCommand, BoardProtocol, BoardReading
 from pressure_driver.emulator.polled import FestoBoard, PneudriveBoard
 from pressure_driver.protocols import LineSplitter
 from pressure_driver.protocols.ctrlp import PASCAL_PER_KILOPASCAL
-from pressure_driver.protocols.ezloop import (
-    LARGEST_WIRE_VALUE,
-    PASCAL_PER_HECTOPASCAL,
-    numbers_of,
-)
+from pressure_driver.protocols.ezloop import LARGEST_WIRE_VALUE, PASCAL_PER_HECTOPASCAL, numbers_of
 from pressure_driver.protocols.native import (
     HELLO_BODY,
     LONGEST_VALIDITY,

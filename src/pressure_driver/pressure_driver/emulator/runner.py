@@ -22,9 +22,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pressure_driver.board_socket import BoardSocket
 from pressure_driver.emulator.board import EmulatedBoard, Faults, ReceivedCommand
-from pressure_driver.lines import is_tcp, prefer_thread
+from pressure_driver.lines import BoardSocket, is_tcp, prefer_thread
 from pressure_driver.schedule import NANOSECONDS
 
 TELEMETRY_PERIOD = 50_000_000

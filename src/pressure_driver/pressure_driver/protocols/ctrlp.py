@@ -29,14 +29,7 @@ import re
 from collections import deque
 from collections.abc import Sequence
 
-from pressure_driver.protocols import (
-    BoardReset,
-    BoardText,
-    Echo,
-    Event,
-    LineHost,
-    Telemetry,
-)
+from pressure_driver.protocols import BoardReset, BoardText, Echo, Event, LineHost, Telemetry
 
 PASCAL_PER_KILOPASCAL = 1000.0
 LARGEST_GAUGE = 500.0

@@ -22,13 +22,7 @@ import math
 import re
 from collections.abc import Sequence
 
-from pressure_driver.protocols import (
-    BoardReset,
-    BoardText,
-    Event,
-    LineHost,
-    Telemetry,
-)
+from pressure_driver.protocols import BoardReset, BoardText, Event, LineHost, Telemetry
 
 PASCAL_PER_HECTOPASCAL = 100.0
 LARGEST_WIRE_VALUE = 1250.0
