@@ -66,98 +66,65 @@ def inside(image: NDArray[np.uint8], x: float, y: float) -> bool:
 
 
 @njit(cache=True)
-def _coarse_crossing(profile: NDArray[np.float64], window: float) -> tuple[float, float]:
-    """Return offset of the edge from the middle of a profile [px] and its contrast.
+def _coarse_crossings(
+    slopes: NDArray[np.float64], places: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the offset (n,) [px] of the edge from the middle of each profile.
 
-    The centroid of the squared slopes: pulled little by the cells further in, though a bit toward
-    pixel centres.
+    It is the centroid of the squared slopes: pulled little by the cells further in, though a bit
+    toward pixel centres.
+
+    Args:
+        slopes: (n, m) grey levels from each sample of a profile to the next.
+        places: (m,) px, where these are.
     """
-    step = 2.0 * window / (_PROFILE - 1)
-    weight, moment, contrast = 0.0, 0.0, 0.0
-    for k in range(_PROFILE - 1):
-        slope = profile[k + 1] - profile[k]
-        if slope > 0.0:
-            weight += slope * slope
-            moment += slope * slope * (-window + (k + 0.5) * step)
-            contrast += slope
-    return (moment / weight if weight > 0.0 else 0.0), contrast
+    squares = np.maximum(slopes, 0.0) ** 2
+    return (squares @ places) / np.maximum(squares @ np.ones_like(places), 1e-12)
 
 
 @njit(cache=True)
 def _fine_crossings(
-    profiles: NDArray[np.float64],
-    usable: NDArray[np.bool_],
-    window: float,
-    across: NDArray[np.float64],
-) -> None:
-    """Place the edge of each profile by the centroid of its slope under a Gaussian.
+    slopes: NDArray[np.float64], places: NDArray[np.float64], usable: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """Return the same by the centroid of the slope under a Gaussian.
 
     The contrast is that of the whole side, which keeps the noise of single profiles out. An edge in
     the middle stays in the middle whatever its blur; one beside it is pulled toward the middle,
     which the gain undoes for a usual blur and the next pass for any.
     """
-    step = 2.0 * window / (_PROFILE - 1)
-    places = -window + (np.arange(_PROFILE - 1) + 0.5) * step
     weights = np.exp(-0.5 * (places / _GAUSSIAN) ** 2)
-    total, count = 0.0, 0
-    for i in range(profiles.shape[0]):
-        if not usable[i]:
-            continue
-        moment = 0.0
-        for k in range(_PROFILE - 1):
-            slope = weights[k] * (profiles[i, k + 1] - profiles[i, k])
-            moment += slope * places[k]
-            total += slope
-        across[i] = moment
-        count += 1
-    if total <= 0.0:
-        return
+    contrast = np.sum((slopes @ weights) * usable) / max(usable.sum(), 1)
     gain = 1.0 + _USUAL_BLUR**2 / _GAUSSIAN**2
-    for i in range(profiles.shape[0]):
-        if usable[i]:
-            across[i] *= gain * count / total
+    return (slopes @ (weights * places)) * (gain / contrast if contrast > 0.0 else 1.0)
 
 
 @njit(cache=True)
 def _fit_line(
-    along: NDArray[np.float64],
-    across: NDArray[np.float64],
-    weights: NDArray[np.float64],
-    result: NDArray[np.float64],
-) -> bool:
+    along: NDArray[np.float64], across: NDArray[np.float64], usable: NDArray[np.bool_]
+) -> NDArray[np.float64]:
     """Fit across = middle + slope along, three times, leaving out what is far off.
 
-    The weights (0 or 1) are changed; the result is middle, slope, mean and spread of `along`, RMS
-    residual and number of points used.
+    Returns:
+        Middle, slope, mean and spread of `along`, RMS residual and number of points used, which is
+        zero if there is no line.
     """
+    weights, result = usable.astype(np.float64), np.zeros(6)
     for _ in range(3):
-        sw = sx = sy = sxx = sxy = 0.0
-        for i in range(along.shape[0]):
-            w = weights[i]
-            sw += w
-            sx += w * along[i]
-            sy += w * across[i]
-            sxx += w * along[i] * along[i]
-            sxy += w * along[i] * across[i]
-        if sw < 5.0:
-            return False
-        mean = sx / sw
-        spread = sxx - sx * mean
+        count = weights.sum()
+        if count < 5.0:
+            return np.zeros(6)
+        mean = (weights @ along) / count
+        lever = weights * (along - mean)
+        spread = lever @ along
         if spread < 1e-6:
-            return False
-        slope = (sxy - sy * mean) / spread
-        middle = sy / sw - slope * mean
-        total = 0.0
-        for i in range(along.shape[0]):
-            total += weights[i] * (across[i] - middle - slope * along[i]) ** 2
-        rms = math.sqrt(total / max(sw - 2.0, 1.0))
-        gate = max(3.0 * rms, 0.05)
-        for i in range(along.shape[0]):
-            if abs(across[i] - middle - slope * along[i]) > gate:
-                weights[i] = 0.0
-        result[0], result[1], result[2] = middle, slope, mean
-        result[3], result[4], result[5] = spread, rms, sw
-    return True
+            return np.zeros(6)
+        slope = (lever @ across) / spread
+        middle = (weights @ across) / count - slope * mean
+        off = across - middle - slope * along
+        rms = math.sqrt((weights * off) @ off / max(count - 2.0, 1.0))
+        weights *= np.abs(off) <= max(3.0 * rms, 0.05)
+        result[:] = (middle, slope, mean, spread, rms, count)
+    return result
 
 
 @njit(cache=True)
@@ -180,32 +147,31 @@ def _fit_side(
     inset = min(max(1.5, 0.05 * length), 0.25 * length)
     count = min(max(int(length - 2.0 * inset), 6), _MAX_SAMPLES)
     spacing = (length - 2.0 * inset) / (count - 1)
-    along, across, contrasts = np.empty(count), np.zeros(count), np.zeros(count)
+    along = inset + np.arange(count) * spacing - 0.5 * length
     profiles = np.zeros((count, _PROFILE))
     step = 2.0 * window / (_PROFILE - 1)
     for i in range(count):
-        along[i] = inset + i * spacing - 0.5 * length
         px, py = middle_x + along[i] * tx, middle_y + along[i] * ty
         x, y = px - window * nx, py - window * ny
         if not (inside(image, x, y) and inside(image, px + window * nx, py + window * ny)):
             continue
         for k in range(_PROFILE):
             profiles[i, k] = sample(image, x + k * step * nx, y + k * step * ny)
-        if coarse:
-            across[i], contrasts[i] = _coarse_crossing(profiles[i], window)
-        else:
-            contrasts[i] = profiles[i, _PROFILE - 1] - profiles[i, 0]
+    slopes = profiles[:, 1:] - profiles[:, :-1]
+    places = -window + (np.arange(_PROFILE - 1) + 0.5) * step
+    contrasts = (np.maximum(slopes, 0.0) if coarse else slopes) @ np.ones_like(places)
     typical = np.median(contrasts)
     if typical < _LEAST_CONTRAST:
         return False
     usable = contrasts > 0.6 * typical
-    if not coarse:
-        _fine_crossings(profiles, usable, window, across)
+    if coarse:
+        across = _coarse_crossings(slopes, places)
+    else:
+        across = _fine_crossings(slopes, places, usable)
     usable &= np.abs(across) < 0.95 * window
-    fit = np.empty(6)
-    if not _fit_line(along, across, usable.astype(np.float64), fit):
+    middle, slope, mean, spread, rms, used = _fit_line(along, across, usable)
+    if used == 0.0:
         return False
-    middle, slope, mean, spread, rms, used = fit
     dx, dy = tx + slope * nx, ty + slope * ny
     norm = math.hypot(dx, dy)
     # Neighbouring profiles share pixels, which makes about two of them worth one.
