@@ -4,10 +4,13 @@ import dataclasses
 
 import cv2
 import numpy as np
+import pytest
 
 from apriltag_tracker.camera import CameraPose, project
 from apriltag_tracker.detection import Tag
-from apriltag_tracker.pose.world import LASTING_ERROR, WorldPose
+from apriltag_tracker.pose.shape import centreline_pose
+from apriltag_tracker.pose.world import LASTING_ERROR, WorldPose, locate, planar_poses
+from apriltag_tracker.tag_map import UNIT_CORNERS, LimbTag
 
 
 def tags_seen(tags, model, pose, noise=0.0, random=None, moved=None):
@@ -82,3 +85,61 @@ def test_the_pose_covariance_is_that_of_many_pictures(tags, model):
         error = np.concatenate([turn, shift])
         nees.append(error @ np.linalg.solve(world.covariance, error) / 6.0)
     assert 0.6 < np.mean(nees) < 1.3
+
+
+# ------------------------------------------------------------------- places on tags' planes
+
+
+def planar_pose(corners, size):
+    """Return pose, derivatives and misfit of one square."""
+    return [values[0] for values in planar_poses(corners[None], np.array([size]))]
+
+
+def square(place, size):
+    cosine, sine = np.cos(place[2]), np.sin(place[2])
+    return UNIT_CORNERS @ np.array([[cosine, sine], [-sine, cosine]]) * size + place[:2]
+
+
+@pytest.mark.parametrize("yaw", [-3.0, -0.5, 0.0, 1.0, 3.1])
+def test_a_square_is_placed_exactly(yaw):
+    place, _, misfit = planar_pose(square((0.1, -0.2, yaw), 0.016), 0.016)
+    assert np.allclose(place, (0.1, -0.2, yaw))
+    assert misfit < 1e-12
+
+
+def test_a_square_of_another_size_is_a_misfit():
+    """A tag 3 cm too low looks 5 % smaller: its corners are off by 5 % of half a diagonal."""
+    _, _, misfit = planar_pose(square((0.0, 0.0, 0.3), 0.95 * 0.016), 0.016)
+    assert misfit == pytest.approx(0.05 * 0.016 / np.sqrt(2.0))
+
+
+def test_the_pose_moves_with_the_corners_as_its_derivative_says():
+    random = np.random.default_rng(0)
+    corners = square((0.1, -0.2, 0.7), 0.016) + random.normal(0.0, 1e-4, (4, 2))
+    _, jacobian, _ = planar_pose(corners, 0.016)
+    for k in range(8):
+        step = np.zeros(8)
+        step[k] = 1e-7
+        after = planar_pose(corners + step.reshape(4, 2), 0.016)[0]
+        before = planar_pose(corners - step.reshape(4, 2), 0.016)[0]
+        assert np.allclose(jacobian[:, k], (after - before) / 2e-7, rtol=1e-5, atol=1e-6)
+
+
+def test_tags_are_placed_at_their_height(model):
+    places = np.array([(0.05, 0.03, 0.4), (0.2, -0.1, -2.0)])
+    heights, sizes = np.array([0.03, 0.0]), np.array([0.016, 0.02])
+    pose = CameraPose.looking_down((0.12, 0.0, 0.6), -1.6, (0.06, -0.05))
+    corners = [
+        project(model.intrinsics, pose, np.column_stack([square(place, size), np.full(4, height)]))
+        for place, size, height in zip(places, sizes, heights, strict=True)
+    ]
+    noise = np.array([np.eye(8) * 0.02**2] * 2)
+    found, _, misfits, _ = locate(np.array(corners), noise, heights, sizes, model.intrinsics, pose)
+    assert np.allclose(found, places, atol=1e-9)
+    assert misfits.max() < 1e-9
+
+
+def test_the_mounting_offset_is_taken_off():
+    tag = LimbTag(0, 0.1, 0.03, 0.016, (0.002, -0.001, 0.1))
+    place = centreline_pose(np.array([1.0, 2.0, np.pi / 2 + 0.1]), tag.offset)
+    assert np.allclose(place, (1.0 - 0.001, 2.0 - 0.002, np.pi / 2))

@@ -16,6 +16,8 @@ from apriltag_tracker.pipeline import LimbTracker
 from apriltag_tracker.sheets import BoardLayout
 from apriltag_tracker.tag_map import LimbTag, TagMap
 
+Array = NDArray[np.float64]
+
 LEAST_VIEWS = 8
 _LEAST_CORNERS = 12
 _OUTLIER = 2.5
@@ -37,8 +39,8 @@ class BoardView:
     """
 
     name: str
-    pixels: NDArray[np.float64]
-    points: NDArray[np.float64]
+    pixels: Array
+    points: Array
 
 
 @dataclass(frozen=True)
@@ -165,14 +167,7 @@ def _remarks(covered: float, spread: float, rms: float) -> list[str]:
 
 def _solve(
     views: Sequence[BoardView], width: int, height: int, rational: bool
-) -> tuple[
-    float,
-    NDArray[np.float64],
-    NDArray[np.float64],
-    NDArray[np.float64],
-    NDArray[np.float64],
-    NDArray[np.float64],
-]:
+) -> tuple[float, Array, Array, Array, Array, Array]:
     """Run OpenCV's solver: RMS, matrix, distortion, tilts (v, 2) rad, sigmas, errors (v,) px."""
     flags = cv2.CALIB_RATIONAL_MODEL if rational else 0
     points = [view.points.astype(np.float32) for view in views]
@@ -228,7 +223,7 @@ def calibrate_mounting(
         CalibrationError: no picture gave a camera pose, or a limb tag was never seen.
     """
     tracker = LimbTracker(tags, intrinsics, detector=Detector(family=tags.family))
-    seen: dict[int, list[NDArray[np.float64]]] = {tag.id: [] for tag in tags.limb}
+    seen: dict[int, list[Array]] = {tag.id: [] for tag in tags.limb}
     count = 0
     for count, image in enumerate(images, 1):
         observation = tracker.observe(check_grey(image), float(count))

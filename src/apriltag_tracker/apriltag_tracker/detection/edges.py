@@ -271,35 +271,29 @@ def refine_quads(
                 break
         if found[i]:
             residuals[i] = math.sqrt(np.mean(sides[:, 6] ** 2))
-            _write_covariance(corners[i], sides, covariances[i])
+            covariances[i] = _corner_covariance(corners[i], sides)
     return corners, covariances, residuals, found
 
 
 @njit(cache=True)
-def _write_covariance(
-    corners: NDArray[np.float64], sides: NDArray[np.float64], covariance: NDArray[np.float64]
-) -> None:
+def _corner_covariance(
+    corners: NDArray[np.float64], sides: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Propagate the variances of four lines (4, 7) to the corners they meet in, (8, 8) px².
 
     A line of normal n that moves by δ moves a corner, where it meets a line of direction t, by
     t δ / (t·n).
     """
-    moves = np.empty((4, 2))
+    gain = np.zeros((8, 8))
     for side in range(4):
-        end = (side + 1) % 4
-        half = 0.5 * math.hypot(
-            corners[end, 0] - corners[side, 0], corners[end, 1] - corners[side, 1]
-        )
-        for place in range(2):
-            other = (side + 3) % 4 if place == 0 else end
+        before, end = (side + 3) % 4, (side + 1) % 4
+        along_x, along_y = corners[end] - corners[side]
+        half = 0.5 * math.hypot(along_x, along_y)
+        for corner, other, lever in ((side, before, -half), (end, end, half)):
             tx, ty = sides[other, 2], sides[other, 3]
             across = ty * sides[side, 2] - tx * sides[side, 3]
-            lever = -half if place == 0 else half
-            moves[2 * place, 0], moves[2 * place, 1] = tx / across, tx / across * lever
-            moves[2 * place + 1, 0], moves[2 * place + 1, 1] = ty / across, ty / across * lever
-        for a in range(4):
-            for b in range(4):
-                covariance[(2 * side + a) % 8, (2 * side + b) % 8] += (
-                    moves[a, 0] * moves[b, 0] * sides[side, 4]
-                    + moves[a, 1] * moves[b, 1] * sides[side, 5]
-                )
+            for axis, move in ((0, tx / across), (1, ty / across)):
+                gain[2 * corner + axis, 2 * side] = move
+                gain[2 * corner + axis, 2 * side + 1] = move * lever
+    variances = sides[:, 4:6].copy().ravel()
+    return (gain * variances) @ gain.T
