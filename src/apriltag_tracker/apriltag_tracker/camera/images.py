@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -159,16 +159,6 @@ class Grabbed:
 
     gray: NDArray[np.uint8]
     stamp: int
-
-
-class Source(Protocol):
-    """Something that gives images."""
-
-    def read(self) -> Grabbed | None:
-        """Return the next image, None while there is none; `SourceError` after the last."""
-
-    def close(self) -> None:
-        """Release it."""
 
 
 def open_source(
@@ -343,6 +333,10 @@ class DeviceSource:
             if not self._stop.is_set():
                 self._video.release()
                 self._video = self._open()
+
+
+Source = FolderSource | VideoSource | DeviceSource
+"""Something that gives images."""
 
 
 def _open_device(name: str) -> Any:

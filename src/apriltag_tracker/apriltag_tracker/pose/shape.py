@@ -8,6 +8,7 @@ least-squares fit of the tags' positions and headings (maximum a posteriori, Gau
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -169,7 +170,7 @@ class ShapeFitter:
         self._outline = Evaluation(
             self._smooth, np.linspace(0.0, geometry.length, CURVE_POINTS).tolist()
         )
-        self._evaluations: dict[tuple[int, tuple[float, ...]], Evaluation] = {}
+        self._evaluation = functools.lru_cache(maxsize=200)(Evaluation)
         self._last = np.zeros(self._smooth.size)
 
     def reset(self) -> None:
@@ -199,11 +200,9 @@ class ShapeFitter:
         fit = self._solve(self._smooth, kept, self._last)
         self._last = fit.parameters
         order = [i for i, tag in enumerate(tags) if tag.id not in rejected]
-        shared = tuple(
-            np.zeros((len(order), PLACE, 1)) if moves is None else moves[order]
-            for moves in (common, shared_noise)
-        )
-        return self._estimate(fit, arcs, kept, rejected, shared[0], shared[1])
+        none = np.zeros((len(tags), PLACE, 1))
+        common, shared_noise = (none if m is None else m for m in (common, shared_noise))
+        return self._estimate(fit, arcs, kept, rejected, common[order], shared_noise[order])
 
     def _consistent(
         self, tags: list[PlanarTag]
@@ -250,14 +249,6 @@ class ShapeFitter:
         )
         return outside, float(np.hypot(*(place[0, :2] - tag.pose[:2]))), rest[outside]
 
-    def _evaluation(self, curve: Curve, arc_lengths: tuple[float, ...]) -> Evaluation:
-        key = (curve.size, arc_lengths)
-        if key not in self._evaluations:
-            if len(self._evaluations) > 200:
-                self._evaluations.clear()
-            self._evaluations[key] = Evaluation(curve, key[1])
-        return self._evaluations[key]
-
     def _prior_sigma(self, curve: Curve) -> NDArray[np.float64]:
         prior = self.prior
         base = [prior.base_position, prior.base_position, prior.base_heading, prior.elongation]
@@ -273,12 +264,9 @@ class ShapeFitter:
         """Find the most probable parameters and the gain (size, n, 3) from measurements to them."""
         evaluation = self._evaluation(curve, tuple(tag.arc_length for tag in tags))
         prior = self.prior
-        slack = (
-            (prior.tag_position, prior.tag_heading)
-            if curve.degrees
-            else (prior.arc_position, prior.arc_heading)
-        )
-        position, heading = slack
+        position, heading = prior.arc_position, prior.arc_heading
+        if curve.degrees:
+            position, heading = prior.tag_position, prior.tag_heading
         covariances = np.array([tag.covariance for tag in tags])
         return fit_curve(
             evaluation,

@@ -117,7 +117,6 @@ class ReceivedCommand:
     """[ns] arrival of its first byte."""
     pressure: tuple[float, ...]
     """(2M,) [Pa] absolute, decoded from the wire."""
-    vent: bool
 
 
 class EmulatedBoard:
@@ -202,13 +201,8 @@ class EmulatedBoard:
                 continue
             answer += self._execute(command)
             if command.kind in ("setpoint", "vent"):
-                received.append(
-                    ReceivedCommand(
-                        self._stamp_of(command.first_byte),
-                        self._wire_pressure(command),
-                        command.kind == "vent",
-                    )
-                )
+                began = self._stamp_of(command.first_byte)
+                received.append(ReceivedCommand(began, self._wire_pressure(command)))
         if self.faults.mute:
             answer = b""
         return received, self.faults.damage(answer, self._generator)
