@@ -16,7 +16,8 @@ import signal
 import socket
 import sys
 import time
-from typing import Any
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, cast
 
 from pressure_driver import lines
 from pressure_driver.core import DriverCore
@@ -24,7 +25,9 @@ from pressure_driver.following import Duration
 from pressure_driver.lines import Channel, Line, may_open, open_line, vent_line
 from pressure_driver.protocols import host_protocol
 from pressure_driver.schedule import Origin, Setpoint, TickGrid, Verdict
-from pressure_driver.settings import Settings
+
+if TYPE_CHECKING:
+    from pressure_driver.settings import Settings
 
 RETRY_TIME = 0.2
 """[s] between two attempts to open a port that was lost."""
@@ -341,7 +344,8 @@ def main() -> int:
     descriptor, values = sys.argv[1:]
     near = socket.socket(fileno=int(descriptor))
     near.setblocking(False)
-    process = BoardProcess(Settings(**json.loads(values)), Channel(near), NODE_PATIENCE)
+    settings = cast("Settings", SimpleNamespace(**json.loads(values)))
+    process = BoardProcess(settings, Channel(near), NODE_PATIENCE)
     # What ends the node must not end the process before it: the node says when.
     for number in (signal.SIGINT, signal.SIGHUP, signal.SIGQUIT):
         signal.signal(number, signal.SIG_IGN)

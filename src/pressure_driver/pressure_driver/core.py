@@ -9,7 +9,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pressure_driver.following import chamber_gauge
 from pressure_driver.protocols import (
@@ -25,8 +25,10 @@ from pressure_driver.protocols import (
 )
 from pressure_driver.safety import LIVE, Mode, SafetyMachine
 from pressure_driver.schedule import NANOSECONDS, Origin, RunningClock, Setpoint, Verdict
-from pressure_driver.settings import Settings
 from pressure_driver.telemetry import Condition, TelemetryMonitor
+
+if TYPE_CHECKING:
+    from pressure_driver.settings import Settings
 
 LARGEST_CLOCK_STEP = 0.3
 """[s] between two ticks, above slewing and late wakes, that means the wall clock was set."""

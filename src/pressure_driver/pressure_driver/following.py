@@ -7,9 +7,11 @@ import math
 from collections import deque
 from collections.abc import Iterator, Sequence
 from statistics import fmean
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-from pressure_driver.settings import Settings
+if TYPE_CHECKING:
+    from pressure_driver.settings import Settings
+
 
 LONGEST_DELAY = 2.0
 """[s] from a command to the pressure: 0.2 to 1.7 s in logs of a real board."""

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from enum import IntEnum
+from typing import TYPE_CHECKING
 
 from pressure_driver.schedule import (
     NANOSECONDS,
@@ -31,8 +32,10 @@ from pressure_driver.schedule import (
     SpentPlans,
     Verdict,
 )
-from pressure_driver.settings import Settings
 from pressure_driver.telemetry import Condition, TelemetryMonitor
+
+if TYPE_CHECKING:
+    from pressure_driver.settings import Settings
 
 
 class Mode(IntEnum):

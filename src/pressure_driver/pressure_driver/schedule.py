@@ -12,9 +12,11 @@ from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-from pressure_driver.settings import Settings
+if TYPE_CHECKING:
+    from pressure_driver.settings import Settings
+
 
 NANOSECONDS = 1_000_000_000
 CAPACITY = 4096

@@ -6,11 +6,13 @@ import math
 from collections import deque
 from collections.abc import Iterator, Sequence
 from statistics import fmean
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from pressure_driver.following import Duration, Following, chamber_gauge
 from pressure_driver.protocols import STANDARD_ATMOSPHERE, HostProtocol, Telemetry
-from pressure_driver.settings import Settings
+
+if TYPE_CHECKING:
+    from pressure_driver.settings import Settings
 
 PLAUSIBLE_READING = (30_000.0, 400_000.0)
 """[Pa] A chamber that reads outside has a broken sensor or a damaged line."""

@@ -28,7 +28,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from pressure_driver.protocols import (
     BoardFailure,
@@ -38,7 +38,9 @@ from pressure_driver.protocols import (
     HostProtocol,
     Telemetry,
 )
-from pressure_driver.settings import Settings
+
+if TYPE_CHECKING:
+    from pressure_driver.settings import Settings
 
 HEADER = struct.Struct(">HHHBB")
 BLOCK = struct.Struct(">HH")

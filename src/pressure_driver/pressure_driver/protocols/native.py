@@ -13,6 +13,7 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import TYPE_CHECKING
 
 from cobs import cobs
 
@@ -27,7 +28,9 @@ from pressure_driver.protocols import (
     StreamCutter,
     Telemetry,
 )
-from pressure_driver.settings import Settings
+
+if TYPE_CHECKING:
+    from pressure_driver.settings import Settings
 
 VERSION = 1
 HEADER = struct.Struct("<BBH")

@@ -14,9 +14,12 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from pressure_driver.protocols import Echo, Event, FrameBuffer, HostProtocol, Telemetry
-from pressure_driver.settings import EmulatorSettings, Settings
+
+if TYPE_CHECKING:
+    from pressure_driver.settings import EmulatorSettings, Settings
 
 FRAME = struct.Struct(">5H")
 FIRST_ADDRESS = 0xFFFF
