@@ -2,7 +2,8 @@
 
 import pytest
 
-from pressure_driver.settings import SettingError, Settings
+from pressure_driver.protocols import SettingError
+from pressure_driver.settings import Settings
 
 
 @pytest.mark.parametrize(

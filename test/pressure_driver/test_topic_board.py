@@ -3,8 +3,15 @@
 import pytest
 
 from pressure_driver.emulator.firmware import NativeBoard
-from pressure_driver.protocols import BoardFailure, BoardIdentity, Echo, Telemetry, host_protocol
-from pressure_driver.settings import SettingError, TopicBoardSettings
+from pressure_driver.protocols import (
+    BoardFailure,
+    BoardIdentity,
+    Echo,
+    SettingError,
+    Telemetry,
+    host_protocol,
+)
+from pressure_driver.settings import TopicBoardSettings
 from pressure_driver.topic_board import STALE, Scale, WatchedBoard
 
 ROOM = 101_325.0

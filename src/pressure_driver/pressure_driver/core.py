@@ -22,6 +22,7 @@ from pressure_driver.protocols import (
     Event,
     HostProtocol,
     Telemetry,
+    order_of,
 )
 from pressure_driver.safety import LIVE, Mode, SafetyMachine
 from pressure_driver.schedule import NANOSECONDS, Origin, RunningClock, Setpoint, Verdict
@@ -146,7 +147,7 @@ class DriverCore:
         self.monitor = TelemetryMonitor(protocol, settings)
         self.machine = SafetyMachine(settings, self.monitor, self._conditions)
         self.board = BoardWatch(protocol, settings)
-        self._valves = settings.valves
+        self._valves = order_of(settings.wiring, protocol.chamber_count)
         self._log = log
         self._link_fault = "the serial port is not open"
         self._texts: deque[str] = deque()

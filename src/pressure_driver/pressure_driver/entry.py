@@ -18,8 +18,9 @@ from typing import Any
 from pressure_driver.board import BoardProcess
 from pressure_driver.lines import Channel
 from pressure_driver.port_process import explain, stable_name
+from pressure_driver.protocols import SettingError
 from pressure_driver.safety import Mode
-from pressure_driver.settings import SettingError, Settings, declarations
+from pressure_driver.settings import Settings, declarations
 
 
 def _run_node(module: str) -> int:

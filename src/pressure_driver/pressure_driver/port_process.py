@@ -147,11 +147,10 @@ class PortProcess:
             PortError: the port cannot be opened.
         """
         near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        settings = {**vars(self._settings), "valves": self._settings.valves}
         self._process = subprocess.Popen(
             [
                 *(sys.executable, "-m", "pressure_driver.board"),
-                *(str(far.fileno()), json.dumps(settings)),
+                *(str(far.fileno()), json.dumps(vars(self._settings))),
             ],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,

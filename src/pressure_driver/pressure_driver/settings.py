@@ -12,37 +12,12 @@ from collections.abc import Iterator
 from dataclasses import MISSING, Field, dataclass, field, fields
 from typing import Any, NamedTuple, TypeVar
 
-from pressure_driver.protocols import NAMES
+from pressure_driver.protocols import NAMES, SettingError, order_of
 
 TERMINALS = ("vtem", "mpa")
 TERMINAL = "valves of a `festo` terminal: a motion terminal, or VPPM regulators"
 DEVICE = "number of a `pneudrive` board, which its address follows from"
 SENSOR_RANGE = "of the sensors of a `pneudrive` board, whose counts are a thousandth of it"
-
-
-class SettingError(ValueError):
-    """A parameter has a value that the driver cannot work with; the message names both."""
-
-
-def order_of(text: str, count: int, first: int = 1, name: str = "wiring") -> tuple[int, ...]:
-    """Return the numbers (count,), counted from 0, of a parameter like `wiring`.
-
-    Args:
-        text: each number once; empty: in order.
-        count: of them.
-        first: the smallest one.
-        name: of the parameter.
-
-    Raises:
-        SettingError: it does not name each of them once.
-    """
-    usual = [str(first + k) for k in range(count)]
-    named = text.replace(",", " ").split() or usual
-    if sorted(named) != sorted(usual):
-        raise SettingError(
-            f"parameter '{name}' is '{text}': name each of {', '.join(usual)} once, in any order"
-        )
-    return tuple(int(number) - first for number in named)
 
 
 class Declaration(NamedTuple):

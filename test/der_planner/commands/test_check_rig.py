@@ -12,7 +12,7 @@ from apriltag_tracker.pose.clamp import Clamp
 from apriltag_tracker.tag_map import TagMap
 from der_planner.commands.check_rig import _move_base, played_wiring
 from der_planner.identification.rig import RigError, RigFinding, ValveFinding
-from pressure_driver.settings import SettingError
+from pressure_driver.protocols import SettingError
 
 CONFIG = Path(__file__).resolve().parents[3] / "src" / "apriltag_tracker" / "config"
 

@@ -44,8 +44,8 @@ from der_planner.limb import Limb
 from der_planner.twin import TwinError
 from der_planner.twin.wiring import Wiring
 from limb_interfaces import topics
-from pressure_driver.protocols import NAMES
-from pressure_driver.settings import SettingError, Settings
+from pressure_driver.protocols import NAMES, SettingError
+from pressure_driver.settings import Settings
 
 TAGS_TYPE = "der_msgs/msg/TagDetectionArray"
 CLAMP_OFF = (0.002, 0.002, float(np.deg2rad(1.5)))

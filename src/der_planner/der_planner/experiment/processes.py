@@ -22,7 +22,7 @@ import yaml
 from der_planner.experiment.console import OptionError
 from der_planner.limb import Limb
 from der_planner.planning import Obstacles
-from pressure_driver.settings import order_of
+from pressure_driver.protocols import order_of
 
 STOP_ORDER = (
     "planner",

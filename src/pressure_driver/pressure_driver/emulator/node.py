@@ -21,7 +21,8 @@ from pressure_driver.emulator.firmware import BOARDS
 from pressure_driver.emulator.pneumatics import BoardPneumatics
 from pressure_driver.emulator.runner import BoardRunner, emulated_line
 from pressure_driver.node import read_settings
-from pressure_driver.settings import EmulatorSettings, order_of
+from pressure_driver.protocols import order_of
+from pressure_driver.settings import EmulatorSettings
 
 
 class BoardEmulator(Node):

@@ -8,7 +8,8 @@ from dataclasses import replace
 
 from pressure_driver.emulator import BoardReading
 from pressure_driver.emulator.firmware import NativeBoard
-from pressure_driver.settings import TopicBoardSettings, order_of
+from pressure_driver.protocols import order_of
+from pressure_driver.settings import TopicBoardSettings
 
 STALE = 0.2
 """[s] after which readings are not told any more."""
