@@ -198,9 +198,16 @@ class RunningGraph:
         keys = ("clock_offset_s", "nan"), ("clock_uncertainty_s", "inf")
         return Offset(*(float(told.get(key, unknown)) for key, unknown in keys))
 
-    def arm(self) -> None:
-        """Arm the driver; what forbids it for a moment, as a late report of the board, may pass."""
-        end = time.monotonic() + ARMING
+    def arm(self, patience: float = ARMING) -> None:
+        """Arm the driver; what forbids it for a moment, as a late report of the board, may pass.
+
+        Args:
+            patience: with a driver that refuses [s].
+
+        Raises:
+            GraphError: it still refuses then.
+        """
+        end = time.monotonic() + patience
         while True:
             try:
                 self.client.call("pressure_driver/arm")
