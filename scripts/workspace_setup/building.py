@@ -9,8 +9,15 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
-from workspace_setup.basics import PACKAGES, ROOT, VENV, Job, clean_environment, file_digest
-from workspace_setup.environment import ros_setup_lines
+from workspace_setup.basics import (
+    PACKAGES,
+    ROOT,
+    VENV,
+    Job,
+    clean_environment,
+    file_digest,
+    ros_setup_lines,
+)
 
 INSTALL = ROOT / "install"
 _COMPILED = re.compile(r"^@(\w+\.)?(njit|\w*kernel)\b", re.MULTILINE)

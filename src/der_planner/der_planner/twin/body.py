@@ -22,6 +22,19 @@ SHEAR_STIFFNESS = 27.0 / 28.0 * AXIAL_STIFFNESS / 3.0
 TORSIONAL_STIFFNESS = 0.0117
 RADIUS = 0.0165
 """Outer radius [m]: with 1.066 kg/m it gives the rotary inertia."""
+_ITS_NAMES = {
+    "position": "position_collection",
+    "velocity": "velocity_collection",
+    "directors": "director_collection",
+    "omega": "omega_collection",
+    "acceleration": "acceleration_collection",
+    "alpha": "alpha_collection",
+    "inertia": "mass_second_moment_of_inertia",
+    "inverse_inertia": "inv_mass_second_moment_of_inertia",
+    "ghost_elements": "ghost_elems_idx",
+    "ghost_vertices": "ghost_voronoi_idx",
+}
+"""PyElastica's names of those `RodArrays` that it calls otherwise."""
 
 
 @dataclass(frozen=True)
@@ -106,11 +119,9 @@ def _set_fittings(
     masses = [0.0, hardware.connector_mass, hardware.tip_mass]
     for element, mass in zip(rigid_elements, masses, strict=True):
         rod.mass[element : element + 2] += 0.5 * mass
-        for i, factor in enumerate((0.25, 0.25, 0.5)):
-            rod.mass_second_moment_of_inertia[i, i, element] += factor * mass * RADIUS**2
-            rod.inv_mass_second_moment_of_inertia[i, i, element] = (
-                1.0 / rod.mass_second_moment_of_inertia[i, i, element]
-            )
+        inertia = rod.mass_second_moment_of_inertia[:, :, element]
+        inertia += mass * RADIUS**2 * np.diag([0.25, 0.25, 0.5])
+        rod.inv_mass_second_moment_of_inertia[:, :, element] = np.diag(1.0 / np.diag(inertia))
 
 
 def _material(
@@ -119,21 +130,20 @@ def _material(
     per_vertex = [hardware.segments[index] for index in vertex_segment]
 
     def column(name: str) -> Array:
-        return np.array([getattr(segment, name) for segment in per_vertex], dtype=float)
+        values = np.array([getattr(segment, name) for segment in per_vertex], dtype=float)
+        return np.ascontiguousarray(values.T)
 
     count = len(per_vertex)
+    friction = ("moment", "curvature", "exponent", "share")
     return SectionMaterial(
         flexible_share=share,
         stiffness=column("bending_stiffness"),
         cubic=column("cubic_stiffness"),
         rest=column("rest_curvature"),
         active=np.zeros(count),
-        friction_moment=column("friction_moment"),
-        friction_curvature=column("friction_curvature"),
-        friction_exponent=column("friction_exponent"),
-        friction_share=column("friction_share"),
-        creep_stiffness=np.ascontiguousarray(column("creep_stiffness").T),
-        creep_time=np.ascontiguousarray(column("creep_time").T),
+        **{f"friction_{name}": column(f"friction_{name}") for name in friction},
+        creep_stiffness=column("creep_stiffness"),
+        creep_time=column("creep_time"),
         curvature=np.zeros(count),
         friction=np.zeros(count),
         creep=np.zeros((3, count)),
@@ -142,40 +152,7 @@ def _material(
 
 
 def _arrays(rod: CosseratRod) -> RodArrays:
-    return RodArrays(
-        position=rod.position_collection,
-        velocity=rod.velocity_collection,
-        directors=rod.director_collection,
-        omega=rod.omega_collection,
-        acceleration=rod.acceleration_collection,
-        alpha=rod.alpha_collection,
-        volume=rod.volume,
-        lengths=rod.lengths,
-        tangents=rod.tangents,
-        radius=rod.radius,
-        rest_lengths=rod.rest_lengths,
-        rest_voronoi_lengths=rod.rest_voronoi_lengths,
-        dilatation=rod.dilatation,
-        dilatation_rate=rod.dilatation_rate,
-        voronoi_dilatation=rod.voronoi_dilatation,
-        sigma=rod.sigma,
-        rest_sigma=rod.rest_sigma,
-        kappa=rod.kappa,
-        rest_kappa=rod.rest_kappa,
-        shear_matrix=rod.shear_matrix,
-        bend_matrix=rod.bend_matrix,
-        internal_stress=rod.internal_stress,
-        internal_couple=rod.internal_couple,
-        internal_forces=rod.internal_forces,
-        internal_torques=rod.internal_torques,
-        external_forces=rod.external_forces,
-        external_torques=rod.external_torques,
-        mass=rod.mass,
-        inertia=rod.mass_second_moment_of_inertia,
-        inverse_inertia=rod.inv_mass_second_moment_of_inertia,
-        ghost_elements=rod.ghost_elems_idx,
-        ghost_vertices=rod.ghost_voronoi_idx,
-    )
+    return RodArrays(*(getattr(rod, _ITS_NAMES.get(name, name)) for name in RodArrays._fields))
 
 
 class TwinError(RuntimeError):
