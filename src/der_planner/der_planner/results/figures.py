@@ -17,7 +17,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from der_planner.arrays import Array
-from der_planner.bags.run import RunSeries, Stream
+from der_planner.bags.run import RunSeries
 from der_planner.results.errors import error_series
 from der_planner.results.evaluation import DRAWN, RunResult
 from der_planner.results.statistics import learning_curves
@@ -138,11 +138,11 @@ def _draw_tip_row(row: Sequence[Axes], title: str, runs: Sequence[RunSeries]) ->
             "lw": 1.0,
             "ls": DASHES.get(model, "-."),
         }
-        inside = (run.tip.time >= 0) & (run.tip.time <= run.reference.time[-1])
-        time, tip = run.tip.time[inside], run.tip.value[inside] * CM
+        shown = run.tip.between(0.0, run.reference.time[-1])
+        tip = shown.value * CM
         plane.plot(tip[:, 0], tip[:, 1], label=f"{model.upper()}, measured", **look)
-        over_x.plot(time, tip[:, 0], **look)
-        over_y.plot(time, tip[:, 1], **look)
+        over_x.plot(shown.time, tip[:, 0], **look)
+        over_y.plot(shown.time, tip[:, 1], **look)
     if drawn := runs[0].description.extra.get(DRAWN):
         plane.plot(*np.transpose(drawn) * CM, label="drawn", color="0.6", ls=":")
     reference = runs[0].reference
@@ -242,20 +242,14 @@ def plot_pressures(runs: Sequence[RunSeries], folder: Path) -> list[Path]:
 
 
 def _draw_pressures(row: Sequence[Axes], run: RunSeries, label: str, look: str) -> None:
-    last = run.reference.time[-1]
-
-    def cut(stream: Stream) -> Stream:
-        inside = (stream.time >= 0) & (stream.time <= last)
-        return Stream(stream.time[inside], stream.value[inside] / 1000.0)
-
     looks: dict[str, dict[str, Any]] = {
         "commanded": {"ls": ":", "lw": 0.9},
         "measured": {"ls": DASHES.get(run.description.model, "-.")},
     }
     for name, dash in looks.items():
-        stream = cut(getattr(run, name))
+        stream = getattr(run, name).between(0.0, run.reference.time[-1])
         for segment, axis in enumerate(row if len(stream) else ()):
-            value = stream.value[:, segment]
+            value = stream.value[:, segment] / 1000.0
             axis.plot(stream.time, value, color=look, label=f"{label}, {name}", **dash)
 
 

@@ -102,12 +102,11 @@ def build(hardware: DrawnHardware) -> LimbBody:
 def _set_sections(
     rod: CosseratRod, hardware: DrawnHardware, element_segment: NDArray[np.int64]
 ) -> None:
+    # A short stiff fitting would shorten the step for nothing: it gives like a whole element.
     flexible = rod.rest_lengths[element_segment == 0][0]
-    for k in range(rod.n_elems):
-        # A short stiff fitting would shorten the step for nothing: it gives like a whole element.
-        share = 1.0 if element_segment[k] >= 0 else rod.rest_lengths[k] / flexible
-        rod.shear_matrix[0, 0, k] = rod.shear_matrix[1, 1, k] = SHEAR_STIFFNESS * share
-        rod.shear_matrix[2, 2, k] = AXIAL_STIFFNESS * share
+    share = np.where(element_segment >= 0, 1.0, rod.rest_lengths / flexible)
+    for i, value in enumerate((SHEAR_STIFFNESS, SHEAR_STIFFNESS, AXIAL_STIFFNESS)):
+        rod.shear_matrix[i, i, :] = value * share
     stiffness = max(segment.bending_stiffness for segment in hardware.segments)
     for i, value in enumerate((stiffness, stiffness, TORSIONAL_STIFFNESS)):
         rod.bend_matrix[i, i, :] = value
@@ -233,12 +232,10 @@ class NodeLoads:
         if math.isnan(push.instant) or not push.duration > 0:
             raise TwinError(f"a push needs an instant and a duration above 0 s, got {push}")
         shares = self._shares(push.arc_length)
-        total = self._own_mass + push.mass * shares
-        for other, other_shares in self._pushes:
-            total = total + other.mass * other_shares
-        if np.any(total <= 0.0):
+        hung = [*self._pushes, (push, shares)]
+        if np.any(self._own_mass + sum(each.mass * borne for each, borne in hung) <= 0.0):
             raise TwinError(f"there is no mass of {-push.mass} kg at {push.arc_length} m to take")
-        self._pushes.append((push, shares))
+        self._pushes = hung
 
     def next_change(self, time: float) -> float:
         """Return when the next push begins or ends after a time [s]; infinite for never."""
@@ -267,10 +264,5 @@ class NodeLoads:
             raise TwinError(
                 f"a load at {arc_length} m is not on the limb: its arc length is 0 to {end:.3f} m"
             )
-        place = min(max(arc_length, 0.0), end)
-        index = int(np.clip(np.searchsorted(self._node_arc, place) - 1, 0, len(self._node_arc) - 2))
-        before, after = self._node_arc[index : index + 2]
-        share = (place - before) / (after - before)
-        shares = np.zeros(len(self._node_arc))
-        shares[index : index + 2] = 1.0 - share, share
-        return shares
+        own = np.eye(len(self._node_arc))
+        return np.array([np.interp(arc_length, self._node_arc, node) for node in own])
