@@ -107,3 +107,13 @@ def graph(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Graph]:
     running = Graph(tmp_path, request.path)
     yield running
     running.close()
+
+
+@pytest.fixture(scope="module")
+def module_graph(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Graph]:
+    """Return a `Graph` whose processes end with the file, for tests that can share them."""
+    running = Graph(tmp_path_factory.mktemp("graph"), request.path)
+    yield running
+    running.close()

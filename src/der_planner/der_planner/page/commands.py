@@ -166,10 +166,10 @@ class Commands:
 
 async def _ask(node: str, client: Any, request: Any) -> tuple[Any, str]:
     """Return the response of a node's service, or None and why there is none."""
-    if not client.service_is_ready():
-        return None, f"{node} {_AWAY}"
     loop, came = asyncio.get_running_loop(), asyncio.Event()
     try:
+        if not client.service_is_ready():
+            return None, f"{node} {_AWAY}"
         pending = client.call_async(request)
         # It comes in the executor's thread.
         pending.add_done_callback(lambda _: loop.call_soon_threadsafe(came.set))

@@ -133,14 +133,16 @@ def _material(
         return np.ascontiguousarray(values.T)
 
     count = len(per_vertex)
-    friction = ("moment", "curvature", "exponent", "share")
     return SectionMaterial(
         flexible_share=share,
         stiffness=column("bending_stiffness"),
         cubic=column("cubic_stiffness"),
         rest=column("rest_curvature"),
         active=np.zeros(count),
-        **{f"friction_{name}": column(f"friction_{name}") for name in friction},
+        friction_moment=column("friction_moment"),
+        friction_curvature=column("friction_curvature"),
+        friction_exponent=column("friction_exponent"),
+        friction_share=column("friction_share"),
         creep_stiffness=column("creep_stiffness"),
         creep_time=column("creep_time"),
         curvature=np.zeros(count),
