@@ -244,18 +244,14 @@ def evaluate_bags(
         bag without any.
     """
     for path in paths:
-        yield from _evaluate(path, settings or EvaluationSettings())
-
-
-def _evaluate(path: Path, settings: EvaluationSettings) -> Iterator[Evaluated]:
-    try:
-        record = read_record(path)
-    except (BagError, OSError) as error:
-        yield Evaluated(path, error=str(error))
-        return
-    for namespace in sorted(record.played or record.limbs) or [""]:
         try:
-            run = run_of(record, namespace)
-            yield Evaluated(path, run, evaluate_run(run, settings))
-        except (BagError, EvaluationError, OSError) as error:
+            record = read_record(path)
+        except (BagError, OSError) as error:
             yield Evaluated(path, error=str(error))
+            continue
+        for namespace in sorted(record.played or record.limbs) or [""]:
+            try:
+                run = run_of(record, namespace)
+                yield Evaluated(path, run, evaluate_run(run, settings))
+            except (BagError, EvaluationError, OSError) as error:
+                yield Evaluated(path, error=str(error))

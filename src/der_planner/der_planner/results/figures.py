@@ -13,7 +13,6 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from der_planner.arrays import Array
@@ -57,7 +56,6 @@ def paper_style() -> Iterator[None]:
         "axes.spines.right": False,
         "legend.frameon": False,
         "pdf.fonttype": 42,
-        "svg.fonttype": "none",
         "savefig.dpi": 160,
         "figure.constrained_layout.use": True,
     }
@@ -76,13 +74,6 @@ def save(figure: Figure, folder: Path, name: str) -> list[Path]:
         figure.savefig(path, metadata=stripped)
         paths.append(path)
     return paths
-
-
-def new_figure(width: float, height: float) -> Figure:
-    """Return an empty figure [inch] with a canvas of its own."""
-    figure = Figure(figsize=(width, height))
-    FigureCanvasAgg(figure)
-    return figure
 
 
 def shared_legend(figure: Figure, axes: Iterable[Axes]) -> None:
@@ -120,7 +111,7 @@ def plot_tip(runs: Sequence[RunSeries], folder: Path) -> list[Path]:
     """
     motions = by_motion(runs)
     with paper_style():
-        figure = new_figure(PAGE, 2.1 * len(motions))
+        figure = Figure(figsize=(PAGE, 2.1 * len(motions)))
         axes = figure.subplots(len(motions), 3, squeeze=False)
         for row, (title, members) in zip(axes, motions.items(), strict=True):
             _draw_tip_row(row, title, members)
@@ -167,7 +158,7 @@ def plot_error(runs: Sequence[RunSeries], folder: Path) -> list[Path]:
     motions = by_motion(runs)
     with paper_style():
         wide = PAGE if len(motions) > 1 else COLUMN
-        figure = new_figure(wide, 2.2)
+        figure = Figure(figsize=(wide, 2.2))
         axes = figure.subplots(1, len(motions), squeeze=False, sharey=True)[0]
         for axis, (title, members) in zip(axes, motions.items(), strict=True):
             for index, (label, same) in enumerate(_by_model(members).items()):
@@ -229,7 +220,7 @@ def plot_pressures(runs: Sequence[RunSeries], folder: Path) -> list[Path]:
     motions = by_motion(runs)
     segments = runs[0].commanded.value.shape[1]
     with paper_style():
-        figure = new_figure(PAGE, 1.9 * len(motions))
+        figure = Figure(figsize=(PAGE, 1.9 * len(motions)))
         axes = figure.subplots(len(motions), segments, squeeze=False, sharex="row")
         for row, (title, members) in zip(axes, motions.items(), strict=True):
             for index, (label, same) in enumerate(_by_model(members).items()):
@@ -264,7 +255,7 @@ def plot_learning(results: Sequence[RunResult], folder: Path) -> list[Path]:
     if not curves:
         return []
     with paper_style():
-        figure: Any = new_figure(PAGE if len(curves) > 1 else COLUMN, 2.2)
+        figure: Any = Figure(figsize=(PAGE if len(curves) > 1 else COLUMN, 2.2))
         axes = figure.subplots(1, len(curves), squeeze=False, sharey=True)[0]
         for axis, (motion, trials) in zip(axes, curves.items(), strict=True):
             for errors in trials:
