@@ -5,8 +5,8 @@ The style is that of a two-column paper; its colours are told apart by colour-bl
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -40,27 +40,26 @@ def colour(model: str, index: int = 0) -> str:
     return COLOURS.get(model, OTHER[index % len(OTHER)])
 
 
-@contextmanager
-def paper_style() -> Iterator[None]:
+def paper_style() -> AbstractContextManager[None]:
     """Set font sizes and line widths of a two-column paper, without touching the caller's."""
-    settings: dict[str, Any] = {
-        "font.size": 8,
-        "axes.titlesize": 8,
-        "axes.labelsize": 8,
-        "legend.fontsize": 7,
-        "xtick.labelsize": 7,
-        "ytick.labelsize": 7,
-        "lines.linewidth": 1.2,
-        "axes.linewidth": 0.6,
-        "axes.spines.top": False,
-        "axes.spines.right": False,
-        "legend.frameon": False,
-        "pdf.fonttype": 42,
-        "savefig.dpi": 160,
-        "figure.constrained_layout.use": True,
-    }
-    with mpl.rc_context(settings):
-        yield
+    return mpl.rc_context(
+        {
+            "font.size": 8,
+            "axes.titlesize": 8,
+            "axes.labelsize": 8,
+            "legend.fontsize": 7,
+            "xtick.labelsize": 7,
+            "ytick.labelsize": 7,
+            "lines.linewidth": 1.2,
+            "axes.linewidth": 0.6,
+            "axes.spines.top": False,
+            "axes.spines.right": False,
+            "legend.frameon": False,
+            "pdf.fonttype": 42,
+            "savefig.dpi": 160,
+            "figure.constrained_layout.use": True,
+        }
+    )
 
 
 def save(figure: Figure, folder: Path, name: str) -> list[Path]:
