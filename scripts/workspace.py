@@ -35,8 +35,13 @@ from workspace_setup.basics import (
     run_jobs,
     say,
 )
-from workspace_setup.building import build_jobs, kernel_jobs
-from workspace_setup.python_packages import install_venv, venv_is_complete, write_lock
+from workspace_setup.building import (
+    build_jobs,
+    install_venv,
+    kernel_jobs,
+    venv_is_complete,
+    write_lock,
+)
 
 __all__ = ["APT_ROS", "PACKAGES", "ROOT", "SetupError", "ensure", "enter", "environment", "run"]
 
