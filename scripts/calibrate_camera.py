@@ -1,9 +1,7 @@
 #!/usr/bin/env python3
 """Calibrate the camera, or the mounting of the tags."""
 
-import sys
-
 import workspace
 
 if __name__ == "__main__":
-    sys.exit(workspace.run("apriltag_tracker.commands.calibrate_camera"))
+    workspace.run("apriltag_tracker.commands.calibrate_camera")

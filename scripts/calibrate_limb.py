@@ -1,9 +1,7 @@
 #!/usr/bin/env python3
 """Identify a limb and write its limb file."""
 
-import sys
-
 import workspace
 
 if __name__ == "__main__":
-    sys.exit(workspace.run("der_planner.commands.calibrate_limb"))
+    workspace.run("der_planner.commands.calibrate_limb")

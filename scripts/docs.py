@@ -1,9 +1,7 @@
 #!/usr/bin/env python3
 """Build the site of docs/: python3 scripts/docs.py [--fresh] [--external] [--graph]."""
 
-import sys
-
 import workspace
 
 if __name__ == "__main__":
-    sys.exit(workspace.run("documentation.build"))
+    workspace.run("documentation.build")

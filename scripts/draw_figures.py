@@ -17,4 +17,4 @@ if __name__ == "__main__":
     if len(sys.argv) < 2 or sys.argv[1] not in PAGES:
         sys.exit(f"usage: draw_figures.py {{{','.join(PAGES)}}} [arguments]")
     workspace.enter()
-    sys.exit(workspace.run(f"figures.{sys.argv.pop(1)}"))
+    workspace.run(f"figures.{sys.argv.pop(1)}")

@@ -1,9 +1,7 @@
 #!/usr/bin/env python3
 """Estimate the motion of a recorded run, and what its model lacks, from its bag."""
 
-import sys
-
 import workspace
 
 if __name__ == "__main__":
-    sys.exit(workspace.run("der_planner.commands.estimate"))
+    workspace.run("der_planner.commands.estimate")

@@ -1,9 +1,7 @@
 #!/usr/bin/env python3
 """One step of learning from recorded bags."""
 
-import sys
-
 import workspace
 
 if __name__ == "__main__":
-    sys.exit(workspace.run("der_planner.commands.learn"))
+    workspace.run("der_planner.commands.learn")

@@ -1,9 +1,7 @@
 #!/usr/bin/env python3
 """Print sheets of tags or a calibration board in true size."""
 
-import sys
-
 import workspace
 
 if __name__ == "__main__":
-    sys.exit(workspace.run("apriltag_tracker.commands.make_tags"))
+    workspace.run("apriltag_tracker.commands.make_tags")

@@ -1,9 +1,7 @@
 #!/usr/bin/env python3
 """Play motions on the limb or its twin and report the tracking error."""
 
-import sys
-
 import workspace
 
 if __name__ == "__main__":
-    sys.exit(workspace.run("der_planner.commands.run_experiment"))
+    workspace.run("der_planner.commands.run_experiment")

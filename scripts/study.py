@@ -1,9 +1,7 @@
 #!/usr/bin/env python3
 """Play a study: a table of many runs, on all cores of this machine or on a Dask cluster."""
 
-import sys
-
 import workspace
 
 if __name__ == "__main__":
-    sys.exit(workspace.run("der_planner.commands.study"))
+    workspace.run("der_planner.commands.study")

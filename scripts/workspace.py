@@ -22,6 +22,7 @@ import shutil
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NoReturn
 
 from workspace_setup.basics import (
     APT_ROS,
@@ -30,12 +31,17 @@ from workspace_setup.basics import (
     ROOT,
     VENV,
     SetupError,
+    environment,
     run_jobs,
     say,
 )
-from workspace_setup.building import build_jobs, kernel_jobs
-from workspace_setup.environment import environment
-from workspace_setup.python_packages import install_venv, venv_is_complete, write_lock
+from workspace_setup.building import (
+    build_jobs,
+    install_venv,
+    kernel_jobs,
+    venv_is_complete,
+    write_lock,
+)
 
 __all__ = ["APT_ROS", "PACKAGES", "ROOT", "SetupError", "ensure", "enter", "environment", "run"]
 
@@ -78,14 +84,14 @@ def enter() -> None:
     os.execve(python, [python, *sys.argv], inside)
 
 
-def run(module: str) -> int:
-    """Run ``main()`` of a module inside the workspace; return the exit code.
+def run(module: str) -> NoReturn:
+    """Run ``main()`` of a module inside the workspace, and end with its exit code.
 
     What is installed in the workspace can be imported only inside it, so an entry point names its
     module instead of importing it.
     """
     enter()
-    return int(importlib.import_module(module).main())
+    sys.exit(importlib.import_module(module).main())
 
 
 def main() -> int:

@@ -24,6 +24,8 @@ WHOLE_GRAPH = (
     "test_two_computers",
 )
 """Files of test/graph that run the whole graph, where each node is timed by the others."""
+LONGEST = "test/documentation/test_site.py"
+"""The file without nodes that takes longest."""
 
 
 def _is_whole_graph(nodeid: str) -> bool:
@@ -36,7 +38,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     The whole graph, which one worker runs alone, takes longer than any other file.
     """
     slow = {item.path for item in items if item.get_closest_marker("slow")}
-    items.sort(key=lambda item: (not _is_whole_graph(item.nodeid), item.path not in slow))
+
+    def late(item: pytest.Item) -> tuple[bool, bool]:
+        longest = _is_whole_graph(item.nodeid) or item.nodeid.startswith(LONGEST)
+        return not longest, item.path not in slow
+
+    items.sort(key=late)
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -105,5 +112,15 @@ class Graph:
 def graph(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Graph]:
     """Return a `Graph` whose processes end with the test."""
     running = Graph(tmp_path, request.path)
+    yield running
+    running.close()
+
+
+@pytest.fixture(scope="module")
+def module_graph(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Graph]:
+    """Return a `Graph` whose processes end with the file, for tests that can share them."""
+    running = Graph(tmp_path_factory.mktemp("graph"), request.path)
     yield running
     running.close()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,13 +18,21 @@ MANY_PARAMETERS = {"rod.py uniform", "rod.py simulate"}
 Kind = TypeVar("Kind", bound=ast.AST)
 
 
+@functools.cache
+def nodes() -> list[tuple[Path, ast.AST]]:
+    """Return all of the sources and scripts as their parser sees them, with the files."""
+    paths = [path for folder in ("src", "scripts") for path in (ROOT / folder).rglob("*.py")]
+    return [
+        (path.relative_to(ROOT), node)
+        for path in sorted(paths)
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, (ast.ClassDef, ast.FunctionDef))
+    ]
+
+
 def definitions(kind: type[Kind]) -> Iterator[tuple[Path, Kind]]:
-    """Yield every definition of a kind in the sources and scripts, with its file."""
-    for folder in ("src", "scripts"):
-        for path in sorted((ROOT / folder).rglob("*.py")):
-            for node in ast.walk(ast.parse(path.read_text())):
-                if isinstance(node, kind):
-                    yield path.relative_to(ROOT), node
+    """Return every definition of a kind in the sources and scripts, with its file."""
+    return ((path, node) for path, node in nodes() if isinstance(node, kind))
 
 
 def test_a_public_class_name_means_one_thing():

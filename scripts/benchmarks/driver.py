@@ -26,7 +26,9 @@ from der_msgs.msg import (
     PressureState,
 )
 from der_planner.experiment.client import GraphClient
-from der_planner.experiment.processes import GraphError, NodeProcess
+from der_planner.experiment.console import Progress
+from der_planner.experiment.graph_run import RunningGraph
+from der_planner.experiment.processes import GraphSetup, Hardware, NodeSpec
 from limb_interfaces import qos, topics
 from limb_interfaces.stamps import nanoseconds, stamp_from_nanoseconds
 
@@ -49,21 +51,11 @@ Setpoints = dict[int, tuple[float, ...]]
 """Stamp [ns] -> differential pressures [Pa]."""
 
 
-def _nodes(case: str, port: str, folder: Path) -> list[tuple[str, str, dict[str, object]]]:
-    board = ("pressure_driver", "board_emulator", {"port_link": port})
-    options: dict[str, object] = {"real_time_priority": 0} if case == "ordinary" else {}
-    driver = ("pressure_driver", "pressure_driver", {"port": port, **options})
-    if case != "graph":
-        return [board, driver]
-    return [
-        board,
-        driver,
-        ("der_planner", "limb_twin", {}),
-        ("apriltag_tracker", "synthetic_camera", {}),
-        ("apriltag_tracker", "apriltag_tracker", {}),
-        ("der_planner", "planner", {}),
-        ("der_planner", "recorder", {"output": str(folder / "bag")}),
-    ]
+def _nodes(case: str, port: str, folder: Path) -> list[NodeSpec]:
+    driver = {"real_time_priority": 0} if case == "ordinary" else {}
+    setup = GraphSetup(folder / "bag", {}, hardware=Hardware(driver, twin={}), planner={})
+    # The first two are board and driver.
+    return setup.nodes(port)[: None if case == "graph" else 2]
 
 
 NODE = """
@@ -75,16 +67,26 @@ time.sleep(3.0)
 
 
 @contextlib.contextmanager
-def _company(busy: bool, passing: bool) -> Iterator[None]:
-    """Keep every core busy with a process that never sleeps, and have a node a second appear."""
+def busy_loops(count: int) -> Iterator[None]:
+    """Let processes compute without rest beside everything else."""
+    loops = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count)]
+    try:
+        yield
+    finally:
+        for loop in loops:
+            loop.kill()
+            loop.wait()
+
+
+@contextlib.contextmanager
+def _passing_nodes() -> Iterator[None]:
+    """Have a node a second appear, each for some seconds."""
     end, running = threading.Event(), []
 
     def appear() -> None:
-        while passing and not end.wait(1.0):
+        while not end.wait(1.0):
             running.append(subprocess.Popen([sys.executable, "-c", NODE]))
 
-    for _ in range(os.cpu_count() or 1 if busy else 0):
-        running.append(subprocess.Popen([sys.executable, "-c", "while True: pass"]))
     thread = threading.Thread(target=appear)
     thread.start()
     try:
@@ -97,15 +99,9 @@ def _company(busy: bool, passing: bool) -> Iterator[None]:
             process.wait()
 
 
-def _arm(client: GraphClient) -> bool:
-    with contextlib.suppress(GraphError):
-        client.call("pressure_driver/arm", 20.0)
-        return True
-    return False
-
-
-def _press(client: GraphClient, seen: Heard, count: int) -> list[float]:
+def _press(graph: RunningGraph, seen: Heard, count: int) -> list[float]:
     """Press `vent` under a small command; return the times [s] until it is on the wire."""
+    client = graph.client
     publisher = client.node.create_publisher(
         PressureSetpoint, topics.PRESSURE_SETPOINT, qos.SETPOINTS
     )
@@ -128,7 +124,7 @@ def _press(client: GraphClient, seen: Heard, count: int) -> list[float]:
     times = []
     for press in range(count):
         plan = f"press {press}"
-        client.wait_for(lambda: _arm(client), 60.0, "arming")
+        graph.arm(60.0)
         client.wait_for(commanded, 60.0, "the command on the wire")
         since = len(seen.commands)
         begin = time.time()
@@ -257,18 +253,14 @@ def _measure(case: str, seconds: float, presses: int = 0) -> Samples:
             ChamberPressures, topics.TWIN_BOARD_COMMANDS, qos.SETPOINTS, seen.commands.append
         )
         client.subscribe(PressureState, topics.PRESSURE_STATE, qos.STATES, seen.states.append)
-        processes: dict[str, NodeProcess] = {}
-        port = str(folder / "board")
-        for package, executable, parameters in _nodes(case, port, folder):
-            process = NodeProcess(package, executable, parameters, folder)
-            processes[executable] = process
-            stack.callback(process.stop)
-            client.watch(processes.values())
-            if executable == "board_emulator":
-                client.wait_for(lambda: os.path.lexists(port), 60.0, "the emulated port")
-        client.wait_ready(processes)
-        client.call("pressure_driver/arm", 20.0)
-        stack.enter_context(_company(case not in ("quiet", "graph"), case == "storm"))
+        graph, port = RunningGraph(client, Progress()), str(folder / "board")
+        stack.callback(graph.stop)
+        graph.start(_nodes(case, port, folder), port, folder, {})
+        client.call("pressure_driver/arm")
+        busy = 0 if case in ("quiet", "graph") else os.cpu_count() or 1
+        stack.enter_context(busy_loops(busy))
+        if case == "storm":
+            stack.enter_context(_passing_nodes())
         wanted = play(client, seconds)
         samples = _compare(wanted, seen)
         client.spin(1.1)
@@ -282,7 +274,7 @@ def _measure(case: str, seconds: float, presses: int = 0) -> Samples:
             print(f"driver: vented: {'; '.join(lost[0].faults)}", file=sys.stderr)
         if case == "storm" and presses:
             client.call("pressure_driver/vent", 20.0)
-            samples.presses = _press(client, seen, presses)
+            samples.presses = _press(graph, seen, presses)
         return samples
 
 

@@ -6,9 +6,6 @@ import contextlib
 import os
 import shutil
 import signal
-import socket
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -19,9 +16,12 @@ import numpy as np
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
 
+from benchmarks.driver import busy_loops
 from der_msgs.msg import ChamberPressures, MotionCommand, PressureSetpoint, PressureState
 from der_planner.experiment.client import GraphClient
-from der_planner.experiment.processes import PAGE_TOKEN, GraphError, GraphSetup, NodeProcess
+from der_planner.experiment.console import Progress
+from der_planner.experiment.graph_run import RunningGraph
+from der_planner.experiment.processes import PAGE_TOKEN, GraphError, GraphSetup
 from limb_interfaces import qos, topics
 from limb_interfaces.stamps import nanoseconds, stamp_from_nanoseconds
 
@@ -74,7 +74,6 @@ class PageGraph:
 
     def __init__(self, folder: Path, stack: contextlib.ExitStack, **options: Any) -> None:
         self._folder, self._stack = folder, stack
-        self._processes: dict[str, NodeProcess] = {}
         self._windows = 0
         self.client = stack.enter_context(GraphClient("benchmark"))
         self.commands: list[ChamberPressures] = []
@@ -82,24 +81,16 @@ class PageGraph:
         subscribe = self.client.subscribe
         subscribe(ChamberPressures, topics.TWIN_BOARD_COMMANDS, qos.SETPOINTS, self.commands.append)
         subscribe(PressureState, topics.PRESSURE_STATE, qos.STATES, self.states.append)
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            page_port = free.getsockname()[1]
-        self.url = f"http://127.0.0.1:{page_port}/?token={PAGE_TOKEN}"
         board = str(folder / "board")
         options = {"metadata": {}, "planner": {}, **options}
-        setup = GraphSetup(bag=folder / "bag", page=page_port, **options)
-        for spec in setup.nodes(board):
-            parameters = spec.parameters
+        specs = GraphSetup(bag=folder / "bag", page=0, **options).nodes(board)
+        for spec in specs:
             if spec.executable == "page":  # a window whose picture is taken is silent meanwhile
-                parameters = {**parameters, "lease_period": 10.0}
-            process = NodeProcess(spec.package, spec.executable, parameters, folder)
-            self._processes[spec.executable] = process
-            stack.callback(process.stop)
-            self.client.watch(self._processes.values())
-            if spec.executable == "board_emulator":
-                self.wait(lambda: os.path.lexists(board), "the board's port")
-        self.client.wait_ready(self._processes)
+                spec.parameters["lease_period"] = 10.0
+        self._graph = RunningGraph(self.client, Progress())
+        stack.callback(self._graph.stop)
+        self._graph.start(specs, board, folder, {})
+        self.url = f"{self.client.diagnostic_values('page')['url']}?token={PAGE_TOKEN}"
 
     def open_window(self) -> Any:
         """Open the page in a browser of its own, and wait until it shows pictures."""
@@ -137,22 +128,20 @@ class PageGraph:
     def end(self, name: str, number: signal.Signals = signal.SIGKILL) -> None:
         """Kill or stop a node by a signal; from then on nobody expects any to live."""
         self.client.watch(())
-        self._processes[name].signal(number)
+        self._graph.processes[name].signal(number)
 
     def break_board(self, faults: str) -> None:
         """Give the emulated board faults."""
         value = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=faults)
-        request = SetParameters.Request(parameters=[Parameter(name="faults", value=value)])
-        service = self.client.node.create_client(SetParameters, "board_emulator/set_parameters")
-        self.wait(service.service_is_ready, "the parameters of the board")
-        self.wait(service.call_async(request).done, "the board to break")
+        wanted = [Parameter(name="faults", value=value)]
+        self.client.ask(SetParameters, "board_emulator/set_parameters", parameters=wanted)
 
     def measure_cpu(self, seconds: float) -> float:
         """Return the share of a core [%] that the page's process uses during some seconds."""
-        before, begin = self._processes["page"].measure_cpu(), time.monotonic()
+        page, begin = self._graph.processes["page"], time.monotonic()
+        before = page.measure_cpu()
         self.client.spin(seconds)
-        used = self._processes["page"].measure_cpu() - before
-        return 100.0 * used / (time.monotonic() - begin)
+        return 100.0 * (page.measure_cpu() - before) / (time.monotonic() - begin)
 
 
 @contextlib.contextmanager
@@ -220,18 +209,6 @@ def measure_vent(graph: PageGraph, window: Any, count: int) -> dict[str, float]:
     name = "vent_press_to_first_byte_beside_two_busy_loops"
     times = {f"{name}_p{p}_ms": float(np.percentile(taken, p)) for p in (50, 99, 100)}
     return {f"vent_presses_arrived_of_{count}": float(len(taken)), **times}
-
-
-@contextlib.contextmanager
-def busy_loops(count: int) -> Iterator[None]:
-    """Let processes compute without rest beside everything else."""
-    loops = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count)]
-    try:
-        yield
-    finally:
-        for loop in loops:
-            loop.kill()
-            loop.wait()
 
 
 def measure_alarm(graph: PageGraph, window: Any) -> dict[str, float]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import os
 import tempfile
 import time
@@ -31,16 +33,6 @@ keep: [mean_error_m]
 """
 
 
-class _Silent(Progress):
-    """Says nothing: the figures of a benchmark stand alone."""
-
-    def say(self, text: str) -> None:
-        """Say nothing."""
-
-    def bar(self, done: float, total: float, text: str, unit: str = "s") -> None:
-        """Show nothing."""
-
-
 def run(quick: bool) -> Figures:
     """Measure and print; return every figure with its unit in the key."""
     figures: Figures = {"load_average_at_start": f"{os.getloadavg()[0]:.2f}"}
@@ -58,7 +50,8 @@ def _played(text: str, folder: Path, scheduler: str) -> float:
     path.write_text(text)
     study = Study.read(path)
     begin = time.perf_counter()
-    kept = conduct(study, PlaySettings(folder / f"out_{number}", scheduler), _Silent())
+    with contextlib.redirect_stderr(io.StringIO()):  # the figures of a benchmark stand alone
+        kept = conduct(study, PlaySettings(folder / f"out_{number}", scheduler), Progress())
     wall = time.perf_counter() - begin
     failed = [row["error"] for row in kept.values() if row["error"]]
     if failed:

@@ -103,10 +103,10 @@ def _quality(ends: list[Any], name: str) -> str:
 
 def _parameters(client: GraphClient, name: str, given: dict[str, Any]) -> list[dict[str, Any]]:
     """Return name, default, range and description of each parameter, by their names."""
-    listed = _ask(client, name, "list_parameters", ListParameters, {}).result.names
+    listed = client.ask(ListParameters, f"{name}/list_parameters").result.names
     names = sorted(item for item in listed if not item.startswith(OF_ROS))
-    described = _ask(client, name, "describe_parameters", DescribeParameters, {"names": names})
-    values = _ask(client, name, "get_parameters", GetParameters, {"names": names}).values
+    described = client.ask(DescribeParameters, f"{name}/describe_parameters", names=names)
+    values = client.ask(GetParameters, f"{name}/get_parameters", names=names).values
     found = []
     for item, value in zip(described.descriptors, values, strict=True):
         limits = [*item.floating_point_range, *item.integer_range]
@@ -124,13 +124,3 @@ def _parameters(client: GraphClient, name: str, given: dict[str, Any]) -> list[d
             }
         )
     return found
-
-
-def _ask(client: GraphClient, name: str, service: str, kind: Any, request: dict[str, Any]) -> Any:
-    """Call one of a node's services for its parameters and return the response."""
-    asked = client.node.create_client(kind, f"{name}/{service}")
-    client.wait_for(asked.service_is_ready, 20.0, f"{name}/{service}")
-    future = asked.call_async(kind.Request(**request))
-    client.wait_for(future.done, 20.0, f"an answer of {name}/{service}")
-    client.node.destroy_client(asked)
-    return future.result()

@@ -3,13 +3,23 @@
 from __future__ import annotations
 
 import ast
+import dataclasses
 import itertools
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from documentation import limb_page
+from der_planner.limb import (
+    CalibratedRange,
+    Limb,
+    Pneumatics,
+    PointMass,
+    Segment,
+    Term,
+    declarations,
+)
+from der_planner.results.tables import Table
 from limb_interfaces import topics
 from workspace_setup.basics import ROOT
 
@@ -30,12 +40,29 @@ API = {
 }
 """Pages of the Python interface, and the modules whose public names stand on each."""
 
+LIMB_HEAD = """\
+# The parameters of a limb
+
+All values are SI. A key without a default has to be in the limb file. "Fit" is the unknown by
+which the [calibration](../guide/identification.md) finds the value: its unit, its bounds, and ±
+the standard deviation of what is known before any data. A relative one is ln(value / the prior's).
+Without an entry there, the fit of the bend angles keeps the value; lengths and air have fits of
+their own.
+"""
+LIMB_SECTIONS: tuple[tuple[str, Any], ...] = (
+    ("`segments`, `pcc_segments`: one entry per segment", Segment),
+    ("`pneumatics`", Pneumatics),
+    ("The limb itself", Limb),
+    ("`masses`: one entry, which may have a `name`, per mass that the limb carries", PointMass),
+    ("`calibrated`: one value per segment, and a gravity", CalibratedRange),
+)
+
 
 def write() -> None:
     """Write every generated page."""
     nodes: dict[str, Any] = json.loads(GRAPH.read_text())
     pages = {
-        "limb_parameters": limb_page.page(),
+        "limb_parameters": limb_page(),
         "node_parameters": node_parameters(nodes),
         "topics": topic_page(nodes),
         "messages": message_page(),
@@ -54,16 +81,20 @@ def node_parameters(nodes: dict[str, Any]) -> str:
         "as here. A default that an experiment sets is left out.\n"
     ]
     for node, found in nodes.items():
-        rows = ["| parameter | default | allowed | meaning |", "|---|---|---|---|"]
+        rows = []
         for item in found["parameters"]:
             limits = " to ".join(_number(limit) for limit in item["range"]) or item["choices"]
             shown = item["default"]
             default = "" if shown in ("", []) else f"`{json.dumps(shown)}`"
             text = item["description"] + (" (while it runs, too)" if item["changeable"] else "")
-            cells = (f"`{item['name']}`", default, limits, text)
-            rows.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
-        parts.append(f"## {node}\n\n" + "\n".join(rows) + "\n")
+            rows.append((f"`{item['name']}`", default, limits, text))
+        parts.append(f"## {node}\n\n{_table(('parameter', 'default', 'allowed', 'meaning'), rows)}")
     return "\n".join(parts)
+
+
+def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return a table in Markdown; a bar in a cell does not end it."""
+    return Table(header, [[cell.replace("|", "\\|") for cell in row] for row in rows]).markdown()
 
 
 def _number(value: float) -> str:
@@ -80,10 +111,8 @@ def topic_page(nodes: dict[str, Any]) -> str:
                 entry = ends.setdefault(topic, {"kind": kind, "publishes": [], "subscribes": []})
                 entry[end].append(node)
                 entry.setdefault("quality", quality)
-    head = "| topic | type | from | to | quality | what |"
-    rows = [head, "|---|---|---|---|---|---|"]
-    for topic, entry in sorted(ends.items()):
-        cells = (
+    rows = [
+        (
             f"`{topic}`",
             entry["kind"].replace("/msg/", "/"),
             ", ".join(entry["publishes"]) or "you",
@@ -91,19 +120,19 @@ def topic_page(nodes: dict[str, Any]) -> str:
             entry["quality"],
             known.get(topic, ""),
         )
-        rows.append("| " + " | ".join(cells) + " |")
+        for topic, entry in sorted(ends.items())
+    ]
     services = [
-        f"| `{service}` | {kind.replace('/srv/', '/')} |"
+        (f"`{service}`", kind.replace("/srv/", "/"))
         for found in nodes.values()
         for service, kind in found["services"].items()
     ]
     return (
         f"# Topics and services\n\nIn the namespace `/{topics.NAMESPACE}`. The recorder takes "
         "every topic. The types are on the page of [messages](messages.md).\n\n"
-        + "\n".join(rows)
-        + "\n\n| service | type |\n|---|---|\n"
-        + "\n".join(services)
+        + _table(("topic", "type", "from", "to", "quality", "what"), rows)
         + "\n"
+        + _table(("service", "type"), services)
     )
 
 
@@ -127,3 +156,40 @@ def api_page(name: str, modules: str) -> str:
     """Return the page of one part of the Python interface."""
     blocks = "".join(f"\n.. automodule:: {module}\n" for module in modules.split())
     return f"# {name}\n\n```{{eval-rst}}\n{blocks.strip()}\n```\n"
+
+
+def limb_page() -> str:
+    """Return the page of a limb's parameters, from their declaration."""
+    header = ("key", "unit", "range", "default", "meaning", "how to choose", "fit")
+    parts = [LIMB_HEAD]
+    for title, kind in LIMB_SECTIONS:
+        defaults = {item.name: item.default for item in dataclasses.fields(kind)}
+        rows = [
+            (
+                f"`{name}`",
+                declared.unit,
+                declared.range,
+                _default(defaults[name]),
+                declared.text + (f"; above 0 where `{declared.needs}` is" * bool(declared.needs)),
+                declared.choose,
+                _fit(declared.fit),
+            )
+            for name, declared in declarations(kind).items()
+        ]
+        parts.append(f"## {title}\n\n{_table(header, rows)}")
+    return "\n".join(parts)
+
+
+def _default(value: Any) -> str:
+    if value is dataclasses.MISSING:
+        return ""
+    return f"{value:.4g}" if isinstance(value, float) else str(list(value))
+
+
+def _fit(term: Term | None) -> str:
+    if term is None:
+        return ""
+    name = f"relative, `{term.name}`" if term.relative else f"`{term.name}`"
+    unit = "" if term.unit == "-" else f" {term.unit}"
+    spread = f", ± {term.spread:g}" if term.spread < float("inf") else ""
+    return f"{name} ({term.group}): {term.low:g} to {term.high:g}{unit}{spread}"

@@ -13,29 +13,20 @@ import pytest
 from domain import own_domain
 
 from der_planner.bags.reader import BagReader
+from der_planner.commands import calibrate_limb
 from der_planner.identification import read_bag
 from der_planner.identification.excitation import PERIOD, Excitation, waves, write_excitation
 from der_planner.limb import Limb
 
-ROOT = Path(__file__).resolve().parent.parent.parent
+SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "calibrate_limb.py"
 RIG_SEED = "3"
 """Seed of the twin that stands in for the rig, see conftest.py."""
 pytestmark = pytest.mark.graph
 
 
-def calibrate(out: Path, *arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    script = ROOT / "scripts" / "calibrate_limb.py"
-    return subprocess.run(
-        [sys.executable, script, "--terms", "none", "--out", out, *arguments],
-        env={**os.environ, "ROS_DOMAIN_ID": str(own_domain(__file__))},
-        capture_output=True,
-        text=True,
-        timeout=400,
-        check=False,
-    )
-
-
-def test_a_rig_is_calibrated_as_its_twin_is_in_one_process(graph, rig: Path, tmp_path: Path):
+def test_a_rig_is_calibrated_as_its_twin_is_in_one_process(
+    graph, rig: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     rest = np.zeros((20, 2))
     pressure = np.concatenate([rest, waves(10_000.0, 2, 18.0), rest])
     table = tmp_path / "excitation.csv"
@@ -46,15 +37,24 @@ def test_a_rig_is_calibrated_as_its_twin_is_in_one_process(graph, rig: Path, tmp
     prior = tmp_path / "prior.yaml"
     replace(guess, segments=segments).to_yaml(prior)
 
-    folder, given = tmp_path / "run", ("--play", table, "--prior", prior)
+    folder, given = tmp_path / "run", ("--terms", "none", "--play", table, "--prior", prior)
     graph_file, offline_file = tmp_path / "graph.yaml", tmp_path / "offline.yaml"
-    run = calibrate(graph_file, *given, "--graph", "--hardware", rig, "--folder", folder)
+    onto = ("--graph", "--hardware", rig, "--folder", folder)
+    run = subprocess.run(
+        [sys.executable, SCRIPT, "--out", graph_file, *given, *onto],
+        env={**os.environ, "ROS_DOMAIN_ID": str(own_domain(__file__))},
+        capture_output=True,
+        text=True,
+        timeout=400,
+        check=False,
+    )
     assert run.returncode == 0, run.stderr
     assert "the hardware at" in run.stderr
     assert "WARNING" not in run.stderr
     assert all(process.alive for process in graph.processes), "the rig is not the calibration's"
-    offline = calibrate(offline_file, *given, "--offline", "--seed", RIG_SEED)
-    assert offline.returncode == 0, offline.stderr
+    offline = ("calibrate_limb.py", "--out", offline_file, *given, "--offline", "--seed", RIG_SEED)
+    monkeypatch.setattr(sys, "argv", [*map(str, offline)])
+    assert calibrate_limb.main() == 0
 
     with BagReader(folder / "bag") as reader:
         sent = [m for _, _, m in reader.messages(["/limb/pressure_setpoint"])]

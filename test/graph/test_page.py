@@ -41,11 +41,11 @@ class WatchedPage(Bench):
     """A board, a driver and the page; browsers that look at it."""
 
     def __init__(self, graph: Any, folder: Path, **driver: object) -> None:
+        self.page, self.url = start_page(graph)  # board and driver start meanwhile
         super().__init__(graph, bounds={}, on_lost_operator="vent", **driver)
         self.client.watch([])
         self.folder = folder
         self.browsers: list[Any] = []
-        self.page, self.url = start_page(graph)
         self.client.wait_ready(["page"])
 
     def open(self) -> Any:

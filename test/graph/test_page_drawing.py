@@ -41,7 +41,6 @@ field.select();
 @pytest.fixture
 def rig(graph: Any, tmp_path: Path) -> tuple[Bench, str]:
     """Start a twin with everything; return the driver's bench and the page's address."""
-    bench = Bench(graph, bounds={})
     graph.start("der_planner", "limb_twin")
     graph.start("apriltag_tracker", "synthetic_camera")
     graph.start("apriltag_tracker", "apriltag_tracker")
@@ -49,6 +48,7 @@ def rig(graph: Any, tmp_path: Path) -> tuple[Bench, str]:
     replace(Limb.default(), name="the planner's own").to_yaml(limb_file)
     graph.start("der_planner", "planner", default_method="projected", limb_file=str(limb_file))
     _, url = start_page(graph, drawings=str(tmp_path / "drawings"), lease_period=3.0)
+    bench = Bench(graph, bounds={})
     graph.client.wait_ready([process.executable for process in graph.processes])
     return bench, url
 

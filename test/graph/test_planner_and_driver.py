@@ -15,6 +15,9 @@ class Rig(Bench):
     """The three nodes, and what passes between planner and driver."""
 
     def __init__(self, graph):
+        self.planner = graph.start(
+            "der_planner", "planner"
+        )  # takes longest: others start meanwhile
         super().__init__(graph, bounds={})
         self.setpoints, self.plans = [], []
         self.client.subscribe(
@@ -23,7 +26,6 @@ class Rig(Bench):
         self.client.subscribe(PressurePlan, topics.PLAN, qos.LATCHED, self.plans.append)
         node = self.client.node
         self.motions = node.create_publisher(MotionCommand, topics.COMMAND, qos.COMMANDS)
-        self.planner = graph.start("der_planner", "planner")
         self.client.wait_ready(["planner"])
         self.wait(self.motions.get_subscription_count, "the planner to listen")
         self.wait(lambda: self.said("driver") == "DISARMED", "the planner to hear the driver")

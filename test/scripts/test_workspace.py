@@ -40,7 +40,7 @@ def test_a_machine_without_compiler_is_told_the_command(bare_clone: Path, tmp_pa
 
 
 def test_an_unsupported_python_is_named(bare_clone: Path):
-    script = bare_clone / "scripts" / "workspace_setup" / "python_packages.py"
+    script = bare_clone / "scripts" / "workspace_setup" / "building.py"
     script.write_text(script.read_text().replace("((3, 10), (3, 13))", "((3, 5), (3, 6))"))
     version = f"{sys.version_info[0]}.{sys.version_info[1]}"
     assert f"this is Python {version}" in _complaint(bare_clone)

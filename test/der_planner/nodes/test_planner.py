@@ -1,72 +1,102 @@
 """The planner node as a process: plans, streams, hands over, stops, refuses with a reason."""
 
+from functools import partial
+
 import numpy as np
 import pytest
+from geometry_msgs.msg import PointStamped
+from rclpy.action import ActionClient
 from rclpy.duration import Duration
+from visualization_msgs.msg import MarkerArray
+
+from der_msgs.action import PlayMotion
+from der_msgs.msg import MotionCommand, PressurePlan, PressureSetpoint, PressureState
+from der_planner.experiment.processes import GraphError
+from limb_interfaces import qos, topics
+from limb_interfaces.stamps import nanoseconds
 
 pytestmark = pytest.mark.graph
 
 
+class Planner:
+    """A planner and all that it publishes."""
+
+    def __init__(self, graph, **parameters):
+        self.client = graph.client
+        self.setpoints, self.plans, self.tips, self.markers = [], [], [], []
+        subscribe = self.client.subscribe
+        subscribe(PressureSetpoint, topics.PRESSURE_SETPOINT, qos.SETPOINTS, self._keep)
+        subscribe(PressurePlan, topics.PLAN, qos.LATCHED, self.plans.append)
+        subscribe(PointStamped, topics.TIP_REFERENCE, qos.SETPOINTS, self.tips.append)
+        subscribe(MarkerArray, topics.SHAPE_MARKERS, qos.STATES, self.markers.append)
+        node = self.client.node
+        self.commands = node.create_publisher(MotionCommand, topics.COMMAND, qos.COMMANDS)
+        self.process = graph.start("der_planner", "planner", **parameters)
+        self.client.wait_ready(["planner"])
+        self.client.wait_for(self.commands.get_subscription_count, 30.0, "the planner")
+        self.client.wait_for(lambda: node.count_publishers(topics.PRESSURE_SETPOINT), 30.0, "it")
+        self.action = ActionClient(node, PlayMotion, "planner/play_motion")
+
+    def _keep(self, message):
+        now = self.client.node.get_clock().now().nanoseconds
+        self.setpoints.append((now, message))
+
+    def command(self, motion="asynchronous", **fields):
+        fields = {"model": "der", "amplitude": 0.3, "period": 3.0, "cycles": 1, **fields}
+        self.commands.publish(MotionCommand(motion=motion, **fields))
+
+    def ask(self, heard=lambda _: None, **fields):
+        """Send a goal; return its handle, and the future of its result if it was accepted."""
+        self.client.wait_for(self.action.server_is_ready, 30.0, "the action")
+        fields = {"motion": "asynchronous", "amplitude": 0.3, "cycles": 1, **fields}
+        goal = PlayMotion.Goal(command=MotionCommand(**fields))
+        sent = self.action.send_goal_async(goal, lambda message: heard(message.feedback))
+        self.client.wait_for(sent.done, 30.0, "the goal to be accepted")
+        handle = sent.result()
+        return handle, handle.get_result_async() if handle.accepted else None
+
+    def result_of(self, future):
+        self.client.wait_for(future.done, 60.0, "the result")
+        return future.result().result
+
+    def state(self):
+        return self.client.diagnostic_values("planner")
+
+    def wait_plan(self, plan_id):
+        return self.client.wait_for(
+            lambda: next((p for p in self.plans if p.plan_id == plan_id), None), 60.0, plan_id
+        )
+
+    def wait_state(self, state):
+        self.client.wait_for(lambda: self.state().get("state") == state, 60.0, state)
+        return self.state()
+
+    def wait_refusal(self, words):
+        self.client.wait_for(lambda: words in self.state()["last_refusal"], 30.0, "the refusal")
+
+    def received(self, plan_id):
+        return [m for _, m in self.setpoints if m.plan_id == plan_id]
+
+
 @pytest.fixture
 def planner(graph):
-    from geometry_msgs.msg import PointStamped
-    from visualization_msgs.msg import MarkerArray
+    return partial(Planner, graph)
 
-    from der_msgs.msg import MotionCommand, PressurePlan, PressureSetpoint
-    from limb_interfaces import qos, topics
 
-    class Planner:
-        def __init__(self, **parameters):
-            self.client = graph.client
-            self.setpoints, self.plans, self.tips, self.markers = [], [], [], []
-            self.client.subscribe(
-                PressureSetpoint, topics.PRESSURE_SETPOINT, qos.SETPOINTS, self._keep
-            )
-            self.client.subscribe(PressurePlan, topics.PLAN, qos.LATCHED, self.plans.append)
-            self.client.subscribe(
-                PointStamped, topics.TIP_REFERENCE, qos.SETPOINTS, self.tips.append
-            )
-            self.client.subscribe(
-                MarkerArray, topics.SHAPE_MARKERS, qos.STATES, self.markers.append
-            )
-            node = self.client.node
-            self.commands = node.create_publisher(MotionCommand, topics.COMMAND, qos.COMMANDS)
-            self.process = graph.start("der_planner", "planner", **parameters)
-            self.client.wait_ready(["planner"])
-            self.client.wait_for(self.commands.get_subscription_count, 30.0, "the planner")
-            self.client.wait_for(
-                lambda: self.client.node.count_publishers(topics.PRESSURE_SETPOINT), 30.0, "it"
-            )
+@pytest.fixture(scope="module")
+def running(module_graph):
+    return Planner(module_graph)
 
-        def _keep(self, message):
-            now = self.client.node.get_clock().now().nanoseconds
-            self.setpoints.append((now, message))
 
-        def command(self, motion="asynchronous", **fields):
-            fields = {"model": "der", "amplitude": 0.3, "period": 3.0, "cycles": 1, **fields}
-            self.commands.publish(MotionCommand(motion=motion, **fields))
-
-        def state(self):
-            return self.client.diagnostic_values("planner")
-
-        def wait_plan(self, plan_id):
-            return self.client.wait_for(
-                lambda: next((p for p in self.plans if p.plan_id == plan_id), None), 60.0, plan_id
-            )
-
-        def wait_state(self, state):
-            self.client.wait_for(lambda: self.state().get("state") == state, 60.0, state)
-            return self.state()
-
-        def received(self, plan_id):
-            return [m for _, m in self.setpoints if m.plan_id == plan_id]
-
-    return Planner
+@pytest.fixture
+def plain(running):
+    """A planner with the parameters that it has by itself; tests in the order of this file."""
+    for kept in (running.setpoints, running.plans):
+        kept.clear()
+    return running
 
 
 def stamp(message):
-    from limb_interfaces.stamps import nanoseconds
-
     return nanoseconds(message.header.stamp)
 
 
@@ -98,8 +128,6 @@ def test_a_command_becomes_a_plan_and_timed_setpoints(planner):
 
 
 def test_start_and_stop(planner):
-    from der_planner.experiment.processes import GraphError
-
     node = planner(auto_start=False)
     with pytest.raises(GraphError, match="no plan yet"):
         node.client.call("planner/start")
@@ -114,97 +142,56 @@ def test_start_and_stop(planner):
     assert "stopped streaming" in node.client.call("planner/stop")
     node.wait_state("idle")
     assert len(node.setpoints) < len(plan.time)
-
-
-def test_a_bad_command_leaves_the_plan_that_plays_alone(planner):
-    node = planner()
-    node.command(plan_id="good", period=30.0)  # longer than a refusal takes anywhere
-    node.client.wait_for(lambda: node.received("good"), 60.0, "setpoints")
-    node.command("jump", plan_id="bad")
-    node.client.wait_for(lambda: node.state()["last_refusal"], 60.0, "the refusal")
-    assert (node.state()["state"], node.state()["plan_id"]) == ("streaming", "good")
-    assert "'jump' is unknown" in node.client.diagnostics["planner"].message
-    heard = len(node.received("good"))
-    node.client.wait_for(lambda: len(node.received("good")) > heard + 5, 60.0, "it to go on")
+    node.client.call("planner/start")
+    node.wait_state("streaming")
     assert node.process.stop() == 0
 
 
-def test_the_action_tells_how_it_goes_and_how_it_ended(planner):
-    from rclpy.action import ActionClient
-
-    from der_msgs.action import PlayMotion
-    from der_msgs.msg import MotionCommand
-
-    node = planner()
-    action = ActionClient(node.client.node, PlayMotion, "planner/play_motion")
-    node.client.wait_for(action.server_is_ready, 30.0, "the action")
-    heard = []
-
-    def play(motion="asynchronous", plan_id="", period=2.0, amplitude=0.3):
-        command = MotionCommand(
-            motion=motion, amplitude=amplitude, period=period, cycles=1, plan_id=plan_id
-        )
-        sent = action.send_goal_async(
-            PlayMotion.Goal(command=command), lambda message: heard.append(message.feedback)
-        )
-        node.client.wait_for(sent.done, 30.0, "the goal to be accepted")
-        handle = sent.result()
-        return handle, handle.get_result_async() if handle.accepted else None
-
-    def result_of(future):
-        node.client.wait_for(future.done, 60.0, "the result")
-        return future.result()
-
-    handle, _ = play("jump")
+def test_the_action_tells_how_it_goes_and_how_it_ended(plain):
+    node, heard = plain, []
+    handle, _ = node.ask(motion="jump")
     assert not handle.accepted
-    node.client.wait_for(lambda: "'jump' is unknown" in node.state()["last_refusal"], 30.0, "why")
+    node.wait_refusal("'jump' is unknown")
 
-    _, refused = play(amplitude=1.7)
-    answer = result_of(refused)
-    assert answer.result.outcome == "refused"
-    assert "out of reach" in answer.result.reason
+    _, refused = node.ask(amplitude=1.7, period=2.0)
+    result = node.result_of(refused)
+    assert result.outcome == "refused"
+    assert "out of reach" in result.reason
 
-    _, whole = play(plan_id="whole")
-    answer = result_of(whole)
-    assert (answer.result.outcome, answer.result.plan_id) == ("finished", "whole")
-    assert np.isnan(answer.result.tip_error)  # nothing tracks the tip here
+    _, whole = node.ask(heard.append, plan_id="whole", period=2.0)
+    result = node.result_of(whole)
+    assert (result.outcome, result.plan_id) == ("finished", "whole")
+    assert np.isnan(result.tip_error)  # nothing tracks the tip here
     told = [feedback.progress for feedback in heard if feedback.state == "streaming"]
     assert told == sorted(told)
     assert told[-1] > 0.9
 
-    handle, cut = play(plan_id="cut", period=30.0)
+    handle, cut = node.ask(plan_id="cut", period=30.0)
     node.client.wait_for(lambda: node.received("cut"), 60.0, "setpoints")
     handle.cancel_goal_async()
-    assert result_of(cut).result.outcome == "stopped"
+    assert node.result_of(cut).outcome == "stopped"
     assert len(node.received("cut")) < len(node.wait_plan("cut").time)
 
 
-def goal_result(client, action):
-    """Send a goal, and return what comes of it."""
-    from der_msgs.action import PlayMotion
-    from der_msgs.msg import MotionCommand
+def test_a_bad_command_leaves_the_plan_that_plays_alone(plain):
+    node = plain
+    node.command(plan_id="good", period=30.0)  # longer than a refusal takes anywhere
+    node.client.wait_for(lambda: node.received("good"), 60.0, "setpoints")
+    node.command("jump", plan_id="bad")
+    node.wait_refusal("plan bad")
+    assert (node.state()["state"], node.state()["plan_id"]) == ("streaming", "good")
+    assert "'jump' is unknown" in node.client.diagnostics["planner"].message
+    heard = len(node.received("good"))
+    node.client.wait_for(lambda: len(node.received("good")) > heard + 5, 60.0, "it to go on")
+    node.client.call("planner/stop")
 
-    command = MotionCommand(motion="asynchronous", amplitude=0.3, period=60.0, cycles=1)
-    sent = action.send_goal_async(PlayMotion.Goal(command=command))
-    client.wait_for(sent.done, 30.0, "the goal to be accepted")
-    answer = sent.result().get_result_async()
-    client.wait_for(answer.done, 30.0, "the result")
-    return answer.result().result
 
-
-def test_a_plan_belongs_to_the_arming_in_which_it_was_asked_for(planner):
+def test_a_plan_belongs_to_the_arming_in_which_it_was_asked_for(plain):
     """Asked for while disarmed, by topic or action, it is refused at once and never plays.
 
     So it is while the driver is silent.
     """
-    from rclpy.action import ActionClient
-
-    from der_msgs.action import PlayMotion
-    from der_msgs.msg import PressureState
-    from limb_interfaces import qos, topics
-
-    node = planner()
-    client = node.client
+    node, client = plain, plain.client
     mode = PressureState.DISARMED
     driver = client.node.create_publisher(PressureState, topics.PRESSURE_STATE, qos.STATES)
 
@@ -219,11 +206,8 @@ def test_a_plan_belongs_to_the_arming_in_which_it_was_asked_for(planner):
     ticking = client.node.create_timer(0.05, tick)
     hears("DISARMED")
     node.command(plan_id="early", period=60.0)
-    refused = "early: the driver is DISARMED"
-    client.wait_for(lambda: refused in node.state()["last_refusal"], 30.0, "the refusal")
-    action = ActionClient(client.node, PlayMotion, "planner/play_motion")
-    client.wait_for(action.server_is_ready, 30.0, "the action")
-    result = goal_result(client, action)
+    node.wait_refusal("early: the driver is DISARMED")
+    result = node.result_of(node.ask(period=60.0)[1])
     assert result.outcome == "refused"
     assert "DISARMED" in result.reason
 
@@ -232,8 +216,7 @@ def test_a_plan_belongs_to_the_arming_in_which_it_was_asked_for(planner):
     node.command(plan_id="halted", period=600.0)  # it takes longer to plan than to disarm
     client.wait_for(lambda: node.state()["plan_id"] == "halted", 30.0, "it to be planned")
     mode = PressureState.FAULT
-    refused = "halted: the driver is in FAULT"
-    client.wait_for(lambda: refused in node.state()["last_refusal"], 30.0, "it to be refused")
+    node.wait_refusal("halted: the driver is in FAULT")
     mode = PressureState.ARMED
     hears("ARMED")
     node.command(plan_id="later", period=2.0)
@@ -246,9 +229,8 @@ def test_a_plan_belongs_to_the_arming_in_which_it_was_asked_for(planner):
     ticking.cancel()
     node.wait_state("lost")
     node.command(plan_id="silent", period=600.0)
-    refused = "silent: the driver has said nothing for"
-    client.wait_for(lambda: refused in node.state()["last_refusal"], 30.0, "the refusal")
-    result = goal_result(client, action)
+    node.wait_refusal("silent: the driver has said nothing for")
+    result = node.result_of(node.ask(period=60.0)[1])
     assert result.outcome == "refused"
     log = node.process.log.read_text()
     assert "plan silent accepted" not in log

@@ -8,6 +8,7 @@ import threading
 import time
 from concurrent.futures import Future
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from fastapi.testclient import TestClient
 from apriltag_tracker.tag_map import LimbTag, TagMap
 from der_planner.limb import Limb
 from der_planner.page.access import Desk
-from der_planner.page.commands import Answer, Load
+from der_planner.page.commands import Commands, Load
 from der_planner.page.drawing import DrawingFolder, Previewer
 from der_planner.page.picture import Overlay, PictureFeed
 from der_planner.page.server import Parts, create_app
@@ -28,18 +29,24 @@ GREY: Any = np.full((72, 128), 90, dtype=np.uint8)
 
 
 class Driver:
-    """Answers as the graph's services do, or not at all."""
+    """Stands in for the page's node; the graph's services answer from here, or not at all."""
 
     def __init__(self) -> None:
         self.calls: list[str] = []
         self.answers = True
 
-    def call(self, service: str) -> Future[Answer]:
-        self.calls.append(service)
-        answer: Future[Answer] = Future()
-        if self.answers:
-            answer.set_result(Answer(True, "vented"))
-        return answer
+    def create_client(self, _: object, service: str) -> Any:
+        def call(_: object) -> Future[Any]:
+            self.calls.append(service)
+            answer: Future[Any] = Future()
+            if self.answers:
+                answer.set_result(SimpleNamespace(success=True, message="vented"))
+            return answer
+
+        return SimpleNamespace(service_is_ready=lambda: True, call_async=call)
+
+    def create_publisher(self, *_: object) -> None:
+        return None
 
 
 @pytest.fixture
@@ -50,11 +57,11 @@ def driver() -> Driver:
 @pytest.fixture
 def parts(driver: Driver) -> Parts:
     return Parts(
-        situation=Situation(),
+        situation=(situation := Situation()),
         picture=PictureFeed(15.0),
         overlay=Overlay(TagMap((0.12, 0.12), (LimbTag(0, 0.2, 0.03, 0.015),), ())),
         desk=Desk(),
-        commands=driver,  # type: ignore[arg-type]
+        commands=Commands(driver, situation, 2),  # type: ignore[arg-type]
         previewer=Previewer(Limb.default(), PathLimits(), Load()),
         drawings=DrawingFolder(Path("nowhere")),
     )
@@ -67,7 +74,7 @@ def client(parts: Parts) -> TestClient:
 
 def test_everybody_vents(client: TestClient, driver: Driver) -> None:
     assert client.post("/vent").json() == {"success": True, "message": "vented"}
-    assert driver.calls == ["vent"]
+    assert driver.calls == ["pressure_driver/vent"]
 
 
 def test_a_driver_that_does_not_answer_is_no_vent(

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -65,6 +66,13 @@ def write(folder: Path, text: str) -> Path:
     return path
 
 
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[str]:
+    """Return the address of a cluster with two workers that runs already."""
+    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as running:
+        yield running.scheduler_address
+
+
 def by_key(folder: Path) -> dict[str, dict]:
     """Return the record of every whole line by its key."""
     file = folder / "rows.jsonl"
@@ -73,13 +81,13 @@ def by_key(folder: Path) -> dict[str, dict]:
     return {record["key"]: record for record in map(json.loads, lines)}
 
 
-def test_one_or_two_workers_and_rows_that_fail(tmp_path, monkeypatch):
+def test_one_or_two_workers_and_rows_that_fail(tmp_path, monkeypatch, cluster):
     """The same rows to the last digit, failed ones counted, and done again if that is asked for."""
     monkeypatch.setenv("DER_LIMB_CACHE", str(tmp_path / "cache"))
     study = Study.read(write(tmp_path, RODS))
     folders = [tmp_path / "one", tmp_path / "two"]
-    for workers, folder in enumerate(folders, start=1):
-        conduct(study, PlaySettings(folder, workers=workers), Progress())
+    conduct(study, PlaySettings(folders[0], workers=1), Progress())
+    conduct(study, PlaySettings(folders[1], cluster), Progress())
     one, two = map(by_key, folders)
     assert one == two
     assert set(one) == {row.key for row in study.rows}
@@ -93,7 +101,7 @@ def test_one_or_two_workers_and_rows_that_fail(tmp_path, monkeypatch):
         for failed in (False, True)
     )
     Store(folders[0], study).keep(good, Outcome({}, "lost", one[bad.key]["sources"]))
-    settings = PlaySettings(folders[0], workers=1, retry_failed=True)
+    settings = PlaySettings(folders[0], cluster, retry_failed=True)
     assert conduct(study, settings, Progress()) == one
     page = summarise(study, one, Store(folders[0], study))
     assert {"errors.png", "errors.pdf"} <= {path.name for path in page.parent.iterdir()}
@@ -114,16 +122,16 @@ class Breaking(Progress):
             self._cluster.close()
 
 
-def test_a_cluster_that_breaks(tmp_path):
+def test_a_cluster_that_breaks(tmp_path, cluster):
     """A worker is killed, then the scheduler is gone: nothing is lost, nothing is done again."""
     study, out = Study.read(write(tmp_path, TWINS.format(count=9))), tmp_path / "out"
-    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
-        settings = PlaySettings(out, cluster.scheduler_address)
+    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as doomed:
+        settings = PlaySettings(out, doomed.scheduler_address)
         with pytest.raises(StudyError, match=r"scheduler is gone.*same command goes on from here"):
-            conduct(study, settings, Breaking(cluster))
+            conduct(study, settings, Breaking(doomed))
     kept = (out / "rows.jsonl").read_text()
     assert 4 <= len(by_key(out)) < len(study.rows)
-    found = conduct(study, PlaySettings(out), Progress())
+    found = conduct(study, PlaySettings(out, cluster), Progress())
     assert list(found) == [row.key for row in study.rows]
     assert {record["error"] for record in found.values()} == {None}
     text = (out / "rows.jsonl").read_text()
@@ -131,12 +139,14 @@ def test_a_cluster_that_breaks(tmp_path):
     assert text.count("{") == len(study.rows)
 
 
-def test_a_stopped_study_goes_on(tmp_path):
+def test_a_stopped_study_goes_on(tmp_path, cluster):
     """With the digits of a run at once; and SIGTERM ends it in order."""
     path = write(tmp_path, TWINS.format(count=6))
     study, out = Study.read(path), tmp_path / "out"
-    command = [sys.executable, str(SCRIPT), str(path), "--out", str(out), "--workers", "1"]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as running:
+    command = [sys.executable, str(SCRIPT), str(path), "--out", str(out)]
+    with subprocess.Popen(
+        [*command, "--workers", "1"], stderr=subprocess.PIPE, text=True
+    ) as running:
         while len(by_key(out)) < 2:
             assert running.poll() is None, running.communicate()
             time.sleep(0.02)
@@ -147,7 +157,8 @@ def test_a_stopped_study_goes_on(tmp_path):
     # As a kill or a loss of power leaves it: a line without its end.
     rows = out / "rows.jsonl"
     rows.write_bytes(rows.read_bytes()[:-30])
-    subprocess.run([*command, "--limit", "5"], check=True, timeout=600)
+    more = ["--scheduler", cluster, "--limit", "5"]
+    subprocess.run([*command, *more], check=True, timeout=600)
     stopped = by_key(out)
     assert {row.key for row in study.rows[:5]} <= set(stopped)
     for row in study.rows[:5:2]:

@@ -78,6 +78,17 @@ class Stream:
     def __len__(self) -> int:
         return len(self.time)
 
+    def between(self, first: float, last: float) -> Stream:
+        """Return the samples from one time [s] to another one."""
+        inside = (self.time >= first) & (self.time <= last)
+        return Stream(self.time[inside], self.value[inside])
+
+    @property
+    def known(self) -> Stream:
+        """The samples in which every number is finite."""
+        finite = np.isfinite(self.value).all(axis=1)
+        return Stream(self.time[finite], self.value[finite])
+
 
 def _nothing(columns: int) -> Stream:
     return Stream(np.empty(0), np.empty((0, columns)))

@@ -24,11 +24,7 @@ from mcap.writer import CompressionType, Writer
 
 from der_planner.bags.topics import TopicSpec
 
-COMPRESSIONS = {
-    "none": CompressionType.NONE,
-    "lz4": CompressionType.LZ4,
-    "zstd": CompressionType.ZSTD,
-}
+COMPRESSIONS = {kind.name.lower(): kind for kind in CompressionType}
 METADATA_FILE = "metadata.yaml"
 RUN_KEY = "run"
 """Name of the MCAP metadata record, and of the custom-data entry, that holds the run's JSON."""

@@ -84,7 +84,7 @@ def _main() -> int:
         run(options)
         return 0
     # ROS is imported only by who needs it.
-    from der_planner.experiment.graph_page import experiment_page  # noqa: PLC0415
+    from der_planner.experiment.graph_run import experiment_page  # noqa: PLC0415
 
     progress = Progress()
     check_folder(options.out)

@@ -158,18 +158,32 @@ class GraphClient:
         status = self.diagnostics.get(name)
         return {} if status is None else {pair.key: pair.value for pair in status.values}
 
+    def ask(self, kind: Any, service: str, timeout: float = 20.0, **request: Any) -> Any:
+        """Call a service and return its response.
+
+        Args:
+            kind: class of the service.
+            service: its name, e.g. ``recorder/set_parameters``.
+            timeout: for the service, and then for its answer [s].
+            request: fields of the request.
+
+        Raises:
+            GraphError: there is no such service, or no answer.
+        """
+        client = self.node.create_client(kind, service)
+        self.wait_for(client.service_is_ready, timeout, f"the service {service}")
+        future = client.call_async(kind.Request(**request))
+        self.wait_for(future.done, timeout, f"an answer of the service {service}")
+        self.node.destroy_client(client)
+        return future.result()
+
     def call(self, service: str, timeout: float = 20.0) -> str:
         """Call a std_srvs/Trigger service, e.g. ``pressure_driver/arm``; return its message.
 
         Raises:
             GraphError: there is no such service, no answer, or the answer is a refusal.
         """
-        client = self.node.create_client(Trigger, service)
-        self.wait_for(client.service_is_ready, timeout, f"the service {service}")
-        future = client.call_async(Trigger.Request())
-        self.wait_for(future.done, timeout, f"an answer of the service {service}")
-        answer = future.result()
-        self.node.destroy_client(client)
+        answer = self.ask(Trigger, service, timeout)
         if not answer.success:
             raise GraphError(f"{service} was refused: {answer.message}")
         return str(answer.message)

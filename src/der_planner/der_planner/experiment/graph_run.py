@@ -1,19 +1,30 @@
-"""The graph of a run: nodes started, recording and armed, and left vented and stopped."""
+"""The graph of a run: nodes started, recording and armed, and left vented and stopped.
+
+Beside the graphs of all runs, an experiment may have a page.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
+import signal
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
+
+from rclpy.executors import ExternalShutdownException
 
 from der_msgs.msg import PressureState
 from der_planner.experiment.client import GraphClient
 from der_planner.experiment.console import Progress
+from der_planner.experiment.options import Options
 from der_planner.experiment.processes import (
+    PAGE_TOKEN,
     STOP_ORDER,
     GraphError,
     GraphSetup,
@@ -24,7 +35,7 @@ from der_planner.experiment.processes import (
 )
 from limb_interfaces import qos, topics
 from limb_interfaces.clocks import LARGEST, Offset
-from limb_interfaces.diagnostics import message_version
+from limb_interfaces.diagnostics import DiagnosticsPublisher, Health, message_version
 
 DISCOVERY = 1.0
 """The orchestrator listens for another graph this long [s] before it starts nodes."""
@@ -38,6 +49,8 @@ PORT_VENTS = 3.0
 """The process of a dead driver's port has vented the limb after this time [s]."""
 VENTED_PRESSURE = 1000.0
 """A limb counts as vented below this differential pressure [Pa]."""
+EXPERIMENT = "experiment"
+"""Name of the node that says what the experiment does."""
 
 
 @contextlib.contextmanager
@@ -198,9 +211,16 @@ class RunningGraph:
         keys = ("clock_offset_s", "nan"), ("clock_uncertainty_s", "inf")
         return Offset(*(float(told.get(key, unknown)) for key, unknown in keys))
 
-    def arm(self) -> None:
-        """Arm the driver; what forbids it for a moment, as a late report of the board, may pass."""
-        end = time.monotonic() + ARMING
+    def arm(self, patience: float = ARMING) -> None:
+        """Arm the driver; what forbids it for a moment, as a late report of the board, may pass.
+
+        Args:
+            patience: with a driver that refuses [s].
+
+        Raises:
+            GraphError: it still refuses then.
+        """
+        end = time.monotonic() + patience
         while True:
             try:
                 self.client.call("pressure_driver/arm")
@@ -268,6 +288,65 @@ class RunningGraph:
             )
 
     def stop(self) -> dict[str, int]:
-        """Stop every node; return the exit codes by name."""
+        """Stop every node; return the exit codes by name.
+
+        Those before the driver end beside each other; it vents, and its board is there until then.
+        """
         order = [name for name in STOP_ORDER if name in self.processes]
+        for name in itertools.takewhile(lambda name: name != "pressure_driver", order):
+            self.processes[name].signal(signal.SIGTERM)
         return {name: self.processes[name].stop() for name in order}
+
+
+# The page of an experiment --------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def experiment_page(options: Options, progress: Progress) -> Iterator[NodeProcess]:
+    """Serve the page, and tell it what the experiment does, until the end of the context.
+
+    The page shows the limb of the options; one that is calibrated on the way is near to it.
+
+    Raises:
+        NodeError: it cannot be started, or has ended at once.
+        GraphError: it is not ready in time.
+    """
+    planner: dict[str, Any] = {
+        "limb_file": str(options.limb or ""), "mounting": options.loads.mounting,
+    }  # fmt: skip
+    planner |= {"payload": options.loads.payload, "payload_at": options.loads.payload_at or 0.0}
+    setup = GraphSetup(Path(), {}, hardware=options.hardware, planner=planner, page=options.page)
+    (spec,) = [each for each in setup.nodes("") if each.executable == "page"]
+    parameters = {**spec.parameters, "report": str(options.out / "report")}
+    page = NodeProcess(
+        spec.package, spec.executable, parameters, options.out / "logs", setup.rig.remap
+    )
+    try:
+        with GraphClient(EXPERIMENT) as client:
+            client.watch([page])
+            client.wait_ready(["page"])
+            progress.say(
+                f"the operator's page is at {client.diagnostic_values('page')['url']}"
+                f"?token={PAGE_TOKEN}"
+            )
+            DiagnosticsPublisher(client.node, lambda: Health("ok", progress.newest))
+            client.watch(())
+            ended = threading.Event()
+            speaker = threading.Thread(
+                target=_speak, args=(client, ended), name=EXPERIMENT, daemon=True
+            )
+            speaker.start()
+            try:
+                yield page
+            finally:
+                ended.set()
+                speaker.join(1.0)
+    finally:
+        page.stop()
+
+
+def _speak(client: GraphClient, ended: threading.Event) -> None:
+    """Serve the node until the end: it says once a second what the experiment does."""
+    with contextlib.suppress(ExternalShutdownException):
+        while not ended.is_set():
+            client.spin(0.1)

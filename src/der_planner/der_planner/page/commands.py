@@ -6,7 +6,6 @@ import asyncio
 import json
 import time
 import uuid
-from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -43,6 +42,7 @@ TICK = NANOSECONDS // 20
 """Time [ns] between two setpoints."""
 TICKS_AHEAD = 4
 """The first setpoint of a filling takes effect this many ticks after now."""
+_AWAY = "does not run or cannot be reached"
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Load(NamedTuple):
 
 
 class Commands:
-    """The graph as the page commands it; every method returns at once, from any thread.
+    """The graph as the page commands it; what waits for an answer lets the page go on.
 
     Args:
         node: of the page.
@@ -89,46 +89,29 @@ class Commands:
         )
         self._motions = node.create_publisher(MotionCommand, topics.COMMAND, qos.COMMANDS)
 
-    def call(self, service: str) -> Future[Answer]:
-        """Call one of `SERVICES`."""
-        answer: Future[Answer] = Future()
-        client = self._service_clients[service]
-        if not client.service_is_ready():
-            text = f"{_owner(service)} does not run or cannot be reached"
-            if service == "vent":
-                text += f": NOT VENTED; {SUPPLY}"
-            answer.set_result(Answer(False, text))
-            return answer
+    async def call(self, service: str) -> Answer:
+        """Call one of `SERVICES`; say so if no answer comes."""
+        node = SERVICES[service].partition("/")[0]
+        response, trouble = await _ask(node, self._service_clients[service], Trigger.Request())
+        if response is not None:
+            return Answer(bool(response.success), response.message)
+        if service == "vent":
+            doubt = "" if trouble.endswith(_AWAY) else " as far as the page knows"
+            trouble += f": NOT VENTED{doubt}; {SUPPLY}"
+        return Answer(False, trouble)
 
-        def finish(pending: Any) -> None:
-            if not answer.cancelled():
-                result = pending.result()
-                answer.set_result(Answer(bool(result.success), result.message))
-
-        client.call_async(Trigger.Request()).add_done_callback(finish)
-        return answer
-
-    def record(self, note: str) -> Future[Answer]:
+    async def record(self, note: str) -> Answer:
         """Start the recorder with a note in the bag's metadata."""
-        answer: Future[Answer] = Future()
-        if not self._recorder_parameters.service_is_ready():
-            answer.set_result(Answer(False, "recorder does not run or cannot be reached"))
-            return answer
-
-        def start(pending: Any) -> None:
-            result = pending.result().results[0]
-            if not result.successful:
-                answer.set_result(Answer(False, result.reason))
-                return
-            started = self.call("record_start")
-            started.add_done_callback(lambda done: answer.set_result(done.result()))
-
         metadata = ParameterValue(
             type=ParameterType.PARAMETER_STRING, string_value=json.dumps({"note": note})
         )
         request = SetParameters.Request(parameters=[Parameter(name="metadata", value=metadata)])
-        self._recorder_parameters.call_async(request).add_done_callback(start)
-        return answer
+        response, trouble = await _ask("recorder", self._recorder_parameters, request)
+        if response is None:
+            return Answer(False, trouble)
+        if not response.results[0].successful:
+            return Answer(False, response.results[0].reason)
+        return await self.call("record_start")
 
     async def play(self, command: MotionCommand) -> Answer:
         """Publish a motion command under a new plan id, and return what the planner says of it."""
@@ -181,20 +164,18 @@ class Commands:
         return learned_names(folder) if folder else []
 
 
-def _owner(service: str) -> str:
-    """Return the node that serves a service."""
-    return SERVICES[service].partition("/")[0]
-
-
-async def answer_of(service: str, pending: Future[Answer]) -> Answer:
-    """Wait for a service's answer, and say so if none comes."""
-    owner = _owner(service)
+async def _ask(node: str, client: Any, request: Any) -> tuple[Any, str]:
+    """Return the response of a node's service, or None and why there is none."""
+    loop, came = asyncio.get_running_loop(), asyncio.Event()
     try:
-        return await asyncio.wait_for(asyncio.wrap_future(pending), PATIENCE)
+        if not client.service_is_ready():
+            return None, f"{node} {_AWAY}"
+        pending = client.call_async(request)
+        # It comes in the executor's thread.
+        pending.add_done_callback(lambda _: loop.call_soon_threadsafe(came.set))
+        await asyncio.wait_for(came.wait(), PATIENCE)
+        return pending.result(), ""
     except asyncio.TimeoutError:
-        text = f"no answer from {owner} within {PATIENCE:.0f} s"
+        return None, f"no answer from {node} within {PATIENCE:.0f} s"
     except Exception as error:  # whatever failed, the operator must read it
-        text = f"{owner}: {error or type(error).__name__}"
-    if service == "vent":
-        text += f": NOT VENTED as far as the page knows; {SUPPLY}"
-    return Answer(False, text)
+        return None, f"{node}: {error or type(error).__name__}"

@@ -22,7 +22,7 @@ from fastapi.staticfiles import StaticFiles
 
 from der_planner.limb import LimbError
 from der_planner.page.access import AccessFilter, Binding, Desk
-from der_planner.page.commands import Commands, Load, answer_of
+from der_planner.page.commands import Commands, Load
 from der_planner.page.drawing import DrawingFolder, Previewer
 from der_planner.page.picture import Overlay, PictureFeed
 from der_planner.page.situation import Situation
@@ -67,7 +67,7 @@ def create_app(parts: Parts) -> FastAPI:
     @app.post("/vent")
     async def vent() -> dict[str, bool | str]:
         # Whoever sees the page may vent, operator or not.
-        answer = await answer_of("vent", parts.commands.call("vent"))
+        answer = await parts.commands.call("vent")
         return {"success": answer.success, "message": answer.message}
 
     return app

@@ -10,7 +10,7 @@ from typing import Any
 
 from nicegui import Client, ui
 
-from der_planner.page.commands import FILLING, Answer, answer_of
+from der_planner.page.commands import FILLING, Answer
 from der_planner.page.server import STATIC, Parts
 from der_planner.page.situation import PASCAL_PER_KILOPASCAL
 
@@ -288,7 +288,7 @@ def _add_buttons(client: Client, parts: Parts) -> None:
     async def arm() -> None:
         if may_command():
             try:
-                show_answer(client, await answer_of("arm", parts.commands.call("arm")))
+                show_answer(client, await parts.commands.call("arm"))
             finally:
                 parts.desk.leave(client.id)
 

@@ -10,7 +10,7 @@ from fastapi import FastAPI
 from nicegui import Client, ui
 
 from der_msgs.msg import MotionCommand
-from der_planner.page.commands import Answer, answer_of
+from der_planner.page.commands import Answer
 from der_planner.page.drawing_panel import DrawingPanel
 from der_planner.page.forms import FormError, MotionForm
 from der_planner.page.server import STATIC, Parts
@@ -172,19 +172,18 @@ class OperatorWindow:
 
     async def _call(self, service: str) -> None:
         if self._may_do(service):
-            answer = await answer_of(service, self._parts.commands.call(service))
-            self._show(service.replace("_", " "), answer)
+            self._show(service.replace("_", " "), await self._parts.commands.call(service))
 
     async def _on_record(self) -> None:
         if self._may_do("record"):
-            pending = self._parts.commands.record(str(self._note.value or ""))
-            self._show("record", await answer_of("record_start", pending))
+            answer = await self._parts.commands.record(str(self._note.value or ""))
+            self._show("record", answer)
 
     async def _on_play(self) -> None:
         if not self._may_do("play"):
             return
         if self._source.value == AGAIN:
-            self._show("play", await answer_of("start", self._parts.commands.call("start")))
+            self._show("play", await self._parts.commands.call("start"))
             return
         try:
             command = self._command()

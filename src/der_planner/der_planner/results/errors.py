@@ -95,15 +95,23 @@ def error_series(run: RunSeries, settings: EvaluationSettings | None = None) -> 
     """
     settings = settings or EvaluationSettings()
     lag = split_error(run, settings).lag_s if settings.remove_lag else 0.0
-    first, last = window(run, settings)
-    time = run.tip.time - lag
-    inside = (time >= first) & (time <= last) & np.isfinite(run.tip.value).all(axis=1)
-    if not inside.any():
+    tip = _seen(run, *window(run, settings), lag)
+    return ErrorSeries(tip.time, tip.value - interpolate(run.reference, tip.time))
+
+
+def _seen(run: RunSeries, first: float, last: float, lag: float = 0.0) -> Stream:
+    """Return the measured tip between two times, ``lag`` [s] earlier than it was measured.
+
+    Raises:
+        EvaluationError: it was never seen there.
+    """
+    known = run.tip.known
+    found = Stream(known.time - lag, known.value).between(first, last)
+    if not len(found):
         raise EvaluationError(
             f"{run.description.title}: no valid limb state between the first and the last setpoint"
         )
-    asked = interpolate(run.reference, time[inside])
-    return ErrorSeries(time[inside], run.tip.value[inside] - asked)
+    return found
 
 
 def window(run: RunSeries, settings: EvaluationSettings) -> tuple[float, float]:
@@ -141,15 +149,10 @@ def split_error(run: RunSeries, settings: EvaluationSettings | None = None) -> S
     first, last = window(run, settings or EvaluationSettings())
     # The same samples for every lag, so that residuals compare.
     margin = min(LARGEST_LAG, 0.1 * (last - first))
-    valid = np.isfinite(run.tip.value).all(axis=1)
-    inside = valid & (run.tip.time >= first + margin) & (run.tip.time <= last - margin)
-    if inside.sum() < 3:
-        inside = valid & (run.tip.time >= first) & (run.tip.time <= last)
-    if not inside.any():
-        raise EvaluationError(
-            f"{run.description.title}: no valid limb state between the first and the last setpoint"
-        )
-    time, measured = run.tip.time[inside], run.tip.value[inside]
+    tip = run.tip.known.between(first + margin, last - margin)
+    if len(tip) < 3:
+        tip = _seen(run, first, last)
+    time, measured = tip.time, tip.value
     lag = _best_lag(run.reference, time, measured, margin)
     late = interpolate(run.reference, time - lag)
     offset = (measured - late).mean(axis=0)
@@ -221,19 +224,14 @@ def check_tracker(tip: Stream, truth: Stream | None, first: float, last: float) 
     """
     if truth is None or len(truth) < 2:
         return {}
-    inside = (
-        (tip.time >= max(first, truth.time[0]))
-        & (tip.time <= min(last, truth.time[-1]))
-        & np.isfinite(tip.value).all(axis=1)
-    )
-    if not inside.any():
+    tip = tip.known.between(max(first, truth.time[0]), min(last, truth.time[-1]))
+    if not len(tip):
         return {}
-    simulated = interpolate(truth, tip.time[inside])
-    distance = np.linalg.norm(tip.value[inside] - simulated, axis=1)
+    distance = np.linalg.norm(tip.value - interpolate(truth, tip.time), axis=1)
     return {
         "tracker_rms_m": float(np.sqrt(np.mean(distance**2))),
         "tracker_max_m": float(distance.max()),
-        "tracker_samples": int(inside.sum()),
+        "tracker_samples": len(tip),
     }
 
 

@@ -130,7 +130,7 @@ def evaluate_run(run: RunSeries, settings: EvaluationSettings | None = None) -> 
     settings = settings or EvaluationSettings()
     series = error_series(run, settings)
     first, last = window(run, settings)
-    images = run.tip.time[(run.tip.time >= first) & (run.tip.time <= last)]
+    images = run.tip.between(first, last).time
     dropped, longest = _gaps(images, series.time, first, last)
     split = split_error(run, settings)
     about = run.description
@@ -199,8 +199,8 @@ def _pressure_errors(run: RunSeries, first: float, last: float) -> tuple[float, 
     """RMS of measured minus commanded differential pressure, one a segment [Pa]."""
     if not len(run.measured) or not len(run.commanded):
         return ()
-    inside = (run.measured.time >= first) & (run.measured.time <= last)
-    difference = run.measured.value[inside] - run.commanded.value[inside]
+    measured, commanded = run.measured.between(first, last), run.commanded.between(first, last)
+    difference = measured.value - commanded.value
     if not np.isfinite(difference).any(axis=0).all():
         return ()
     return tuple(np.sqrt(np.nanmean(difference**2, axis=0)).tolist())
@@ -244,18 +244,14 @@ def evaluate_bags(
         bag without any.
     """
     for path in paths:
-        yield from _evaluate(path, settings or EvaluationSettings())
-
-
-def _evaluate(path: Path, settings: EvaluationSettings) -> Iterator[Evaluated]:
-    try:
-        record = read_record(path)
-    except (BagError, OSError) as error:
-        yield Evaluated(path, error=str(error))
-        return
-    for namespace in sorted(record.played or record.limbs) or [""]:
         try:
-            run = run_of(record, namespace)
-            yield Evaluated(path, run, evaluate_run(run, settings))
-        except (BagError, EvaluationError, OSError) as error:
+            record = read_record(path)
+        except (BagError, OSError) as error:
             yield Evaluated(path, error=str(error))
+            continue
+        for namespace in sorted(record.played or record.limbs) or [""]:
+            try:
+                run = run_of(record, namespace)
+                yield Evaluated(path, run, evaluate_run(run, settings))
+            except (BagError, EvaluationError, OSError) as error:
+                yield Evaluated(path, error=str(error))

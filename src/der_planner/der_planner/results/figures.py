@@ -5,19 +5,18 @@ The style is that of a two-column paper; its colours are told apart by colour-bl
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from der_planner.arrays import Array
-from der_planner.bags.run import RunSeries, Stream
+from der_planner.bags.run import RunSeries
 from der_planner.results.errors import error_series
 from der_planner.results.evaluation import DRAWN, RunResult
 from der_planner.results.statistics import learning_curves
@@ -41,28 +40,26 @@ def colour(model: str, index: int = 0) -> str:
     return COLOURS.get(model, OTHER[index % len(OTHER)])
 
 
-@contextmanager
-def paper_style() -> Iterator[None]:
+def paper_style() -> AbstractContextManager[None]:
     """Set font sizes and line widths of a two-column paper, without touching the caller's."""
-    settings: dict[str, Any] = {
-        "font.size": 8,
-        "axes.titlesize": 8,
-        "axes.labelsize": 8,
-        "legend.fontsize": 7,
-        "xtick.labelsize": 7,
-        "ytick.labelsize": 7,
-        "lines.linewidth": 1.2,
-        "axes.linewidth": 0.6,
-        "axes.spines.top": False,
-        "axes.spines.right": False,
-        "legend.frameon": False,
-        "pdf.fonttype": 42,
-        "svg.fonttype": "none",
-        "savefig.dpi": 160,
-        "figure.constrained_layout.use": True,
-    }
-    with mpl.rc_context(settings):
-        yield
+    return mpl.rc_context(
+        {
+            "font.size": 8,
+            "axes.titlesize": 8,
+            "axes.labelsize": 8,
+            "legend.fontsize": 7,
+            "xtick.labelsize": 7,
+            "ytick.labelsize": 7,
+            "lines.linewidth": 1.2,
+            "axes.linewidth": 0.6,
+            "axes.spines.top": False,
+            "axes.spines.right": False,
+            "legend.frameon": False,
+            "pdf.fonttype": 42,
+            "savefig.dpi": 160,
+            "figure.constrained_layout.use": True,
+        }
+    )
 
 
 def save(figure: Figure, folder: Path, name: str) -> list[Path]:
@@ -76,13 +73,6 @@ def save(figure: Figure, folder: Path, name: str) -> list[Path]:
         figure.savefig(path, metadata=stripped)
         paths.append(path)
     return paths
-
-
-def new_figure(width: float, height: float) -> Figure:
-    """Return an empty figure [inch] with a canvas of its own."""
-    figure = Figure(figsize=(width, height))
-    FigureCanvasAgg(figure)
-    return figure
 
 
 def shared_legend(figure: Figure, axes: Iterable[Axes]) -> None:
@@ -120,7 +110,7 @@ def plot_tip(runs: Sequence[RunSeries], folder: Path) -> list[Path]:
     """
     motions = by_motion(runs)
     with paper_style():
-        figure = new_figure(PAGE, 2.1 * len(motions))
+        figure = Figure(figsize=(PAGE, 2.1 * len(motions)))
         axes = figure.subplots(len(motions), 3, squeeze=False)
         for row, (title, members) in zip(axes, motions.items(), strict=True):
             _draw_tip_row(row, title, members)
@@ -138,11 +128,11 @@ def _draw_tip_row(row: Sequence[Axes], title: str, runs: Sequence[RunSeries]) ->
             "lw": 1.0,
             "ls": DASHES.get(model, "-."),
         }
-        inside = (run.tip.time >= 0) & (run.tip.time <= run.reference.time[-1])
-        time, tip = run.tip.time[inside], run.tip.value[inside] * CM
+        shown = run.tip.between(0.0, run.reference.time[-1])
+        tip = shown.value * CM
         plane.plot(tip[:, 0], tip[:, 1], label=f"{model.upper()}, measured", **look)
-        over_x.plot(time, tip[:, 0], **look)
-        over_y.plot(time, tip[:, 1], **look)
+        over_x.plot(shown.time, tip[:, 0], **look)
+        over_y.plot(shown.time, tip[:, 1], **look)
     if drawn := runs[0].description.extra.get(DRAWN):
         plane.plot(*np.transpose(drawn) * CM, label="drawn", color="0.6", ls=":")
     reference = runs[0].reference
@@ -167,7 +157,7 @@ def plot_error(runs: Sequence[RunSeries], folder: Path) -> list[Path]:
     motions = by_motion(runs)
     with paper_style():
         wide = PAGE if len(motions) > 1 else COLUMN
-        figure = new_figure(wide, 2.2)
+        figure = Figure(figsize=(wide, 2.2))
         axes = figure.subplots(1, len(motions), squeeze=False, sharey=True)[0]
         for axis, (title, members) in zip(axes, motions.items(), strict=True):
             for index, (label, same) in enumerate(_by_model(members).items()):
@@ -229,7 +219,7 @@ def plot_pressures(runs: Sequence[RunSeries], folder: Path) -> list[Path]:
     motions = by_motion(runs)
     segments = runs[0].commanded.value.shape[1]
     with paper_style():
-        figure = new_figure(PAGE, 1.9 * len(motions))
+        figure = Figure(figsize=(PAGE, 1.9 * len(motions)))
         axes = figure.subplots(len(motions), segments, squeeze=False, sharex="row")
         for row, (title, members) in zip(axes, motions.items(), strict=True):
             for index, (label, same) in enumerate(_by_model(members).items()):
@@ -242,20 +232,14 @@ def plot_pressures(runs: Sequence[RunSeries], folder: Path) -> list[Path]:
 
 
 def _draw_pressures(row: Sequence[Axes], run: RunSeries, label: str, look: str) -> None:
-    last = run.reference.time[-1]
-
-    def cut(stream: Stream) -> Stream:
-        inside = (stream.time >= 0) & (stream.time <= last)
-        return Stream(stream.time[inside], stream.value[inside] / 1000.0)
-
     looks: dict[str, dict[str, Any]] = {
         "commanded": {"ls": ":", "lw": 0.9},
         "measured": {"ls": DASHES.get(run.description.model, "-.")},
     }
     for name, dash in looks.items():
-        stream = cut(getattr(run, name))
+        stream = getattr(run, name).between(0.0, run.reference.time[-1])
         for segment, axis in enumerate(row if len(stream) else ()):
-            value = stream.value[:, segment]
+            value = stream.value[:, segment] / 1000.0
             axis.plot(stream.time, value, color=look, label=f"{label}, {name}", **dash)
 
 
@@ -270,7 +254,7 @@ def plot_learning(results: Sequence[RunResult], folder: Path) -> list[Path]:
     if not curves:
         return []
     with paper_style():
-        figure: Any = new_figure(PAGE if len(curves) > 1 else COLUMN, 2.2)
+        figure: Any = Figure(figsize=(PAGE if len(curves) > 1 else COLUMN, 2.2))
         axes = figure.subplots(1, len(curves), squeeze=False, sharey=True)[0]
         for axis, (motion, trials) in zip(axes, curves.items(), strict=True):
             for errors in trials:

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from der_planner.arrays import Array
@@ -36,7 +37,6 @@ from der_planner.results.figures import (
     REFERENCE,
     by_motion,
     colour,
-    new_figure,
     paper_style,
     save,
     shared_legend,
@@ -256,7 +256,7 @@ def plot_shapes(runs: Sequence[RunSeries], folder: Path) -> list[Path]:
     if not motions:
         return []
     with paper_style():
-        figure = new_figure(PAGE, 0.4 + 1.6 * len(motions))
+        figure = Figure(figsize=(PAGE, 0.4 + 1.6 * len(motions)))
         axes = figure.subplots(len(motions), INSTANTS, squeeze=False)
         for row, (title, members) in zip(axes, motions.items(), strict=True):
             _draw_row(row, members)

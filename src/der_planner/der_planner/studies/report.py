@@ -104,7 +104,7 @@ def draw_all(study: Study, kept: Mapping[str, Kept], folder: Path) -> list[str]:
 def _panels(study: Study, plot: Mapping[str, str], rows: Records) -> Figure:
     """Return a figure with one panel for each value of the factor ``panels``."""
     panels, log = list(_groups(plot.get("panels"), rows)), plot.get("log", "")
-    drawn = style.new_figure(style.PAGE if len(panels) > 1 else style.COLUMN, _HEIGHT)
+    drawn = Figure(figsize=(style.PAGE if len(panels) > 1 else style.COLUMN, _HEIGHT))
     axes = drawn.subplots(1, len(panels), squeeze=False, sharey=True)[0]
     for (value, mine), panel in zip(panels, axes, strict=True):
         (_histogram if plot["kind"] == "histogram" else _lines)(study, plot, mine, panel)
@@ -245,7 +245,7 @@ def _indices(plot: Mapping[str, str], indices: Sequence[Index]) -> Figure | None
         return None
     ordered = sorted(indices, key=lambda each: each.total)
     place = np.arange(len(ordered))
-    drawn = style.new_figure(style.COLUMN + 1.0, 0.6 + 0.28 * len(ordered))
+    drawn = Figure(figsize=(style.COLUMN + 1.0, 0.6 + 0.28 * len(ordered)))
     panel = drawn.subplots()
     for shift, colour, name, label in (
         (0.2, style.COLOURS["der"], "first", "alone"),

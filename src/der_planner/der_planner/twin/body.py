@@ -22,6 +22,19 @@ SHEAR_STIFFNESS = 27.0 / 28.0 * AXIAL_STIFFNESS / 3.0
 TORSIONAL_STIFFNESS = 0.0117
 RADIUS = 0.0165
 """Outer radius [m]: with 1.066 kg/m it gives the rotary inertia."""
+_ITS_NAMES = {
+    "position": "position_collection",
+    "velocity": "velocity_collection",
+    "directors": "director_collection",
+    "omega": "omega_collection",
+    "acceleration": "acceleration_collection",
+    "alpha": "alpha_collection",
+    "inertia": "mass_second_moment_of_inertia",
+    "inverse_inertia": "inv_mass_second_moment_of_inertia",
+    "ghost_elements": "ghost_elems_idx",
+    "ghost_vertices": "ghost_voronoi_idx",
+}
+"""PyElastica's names of those `RodArrays` that it calls otherwise."""
 
 
 @dataclass(frozen=True)
@@ -89,12 +102,11 @@ def build(hardware: DrawnHardware) -> LimbBody:
 def _set_sections(
     rod: CosseratRod, hardware: DrawnHardware, element_segment: NDArray[np.int64]
 ) -> None:
+    # A short stiff fitting would shorten the step for nothing: it gives like a whole element.
     flexible = rod.rest_lengths[element_segment == 0][0]
-    for k in range(rod.n_elems):
-        # A short stiff fitting would shorten the step for nothing: it gives like a whole element.
-        share = 1.0 if element_segment[k] >= 0 else rod.rest_lengths[k] / flexible
-        rod.shear_matrix[0, 0, k] = rod.shear_matrix[1, 1, k] = SHEAR_STIFFNESS * share
-        rod.shear_matrix[2, 2, k] = AXIAL_STIFFNESS * share
+    share = np.where(element_segment >= 0, 1.0, rod.rest_lengths / flexible)
+    for i, value in enumerate((SHEAR_STIFFNESS, SHEAR_STIFFNESS, AXIAL_STIFFNESS)):
+        rod.shear_matrix[i, i, :] = value * share
     stiffness = max(segment.bending_stiffness for segment in hardware.segments)
     for i, value in enumerate((stiffness, stiffness, TORSIONAL_STIFFNESS)):
         rod.bend_matrix[i, i, :] = value
@@ -106,11 +118,9 @@ def _set_fittings(
     masses = [0.0, hardware.connector_mass, hardware.tip_mass]
     for element, mass in zip(rigid_elements, masses, strict=True):
         rod.mass[element : element + 2] += 0.5 * mass
-        for i, factor in enumerate((0.25, 0.25, 0.5)):
-            rod.mass_second_moment_of_inertia[i, i, element] += factor * mass * RADIUS**2
-            rod.inv_mass_second_moment_of_inertia[i, i, element] = (
-                1.0 / rod.mass_second_moment_of_inertia[i, i, element]
-            )
+        inertia = rod.mass_second_moment_of_inertia[:, :, element]
+        inertia += mass * RADIUS**2 * np.diag([0.25, 0.25, 0.5])
+        rod.inv_mass_second_moment_of_inertia[:, :, element] = np.diag(1.0 / np.diag(inertia))
 
 
 def _material(
@@ -119,7 +129,8 @@ def _material(
     per_vertex = [hardware.segments[index] for index in vertex_segment]
 
     def column(name: str) -> Array:
-        return np.array([getattr(segment, name) for segment in per_vertex], dtype=float)
+        values = np.array([getattr(segment, name) for segment in per_vertex], dtype=float)
+        return np.ascontiguousarray(values.T)
 
     count = len(per_vertex)
     return SectionMaterial(
@@ -132,8 +143,8 @@ def _material(
         friction_curvature=column("friction_curvature"),
         friction_exponent=column("friction_exponent"),
         friction_share=column("friction_share"),
-        creep_stiffness=np.ascontiguousarray(column("creep_stiffness").T),
-        creep_time=np.ascontiguousarray(column("creep_time").T),
+        creep_stiffness=column("creep_stiffness"),
+        creep_time=column("creep_time"),
         curvature=np.zeros(count),
         friction=np.zeros(count),
         creep=np.zeros((3, count)),
@@ -142,40 +153,7 @@ def _material(
 
 
 def _arrays(rod: CosseratRod) -> RodArrays:
-    return RodArrays(
-        position=rod.position_collection,
-        velocity=rod.velocity_collection,
-        directors=rod.director_collection,
-        omega=rod.omega_collection,
-        acceleration=rod.acceleration_collection,
-        alpha=rod.alpha_collection,
-        volume=rod.volume,
-        lengths=rod.lengths,
-        tangents=rod.tangents,
-        radius=rod.radius,
-        rest_lengths=rod.rest_lengths,
-        rest_voronoi_lengths=rod.rest_voronoi_lengths,
-        dilatation=rod.dilatation,
-        dilatation_rate=rod.dilatation_rate,
-        voronoi_dilatation=rod.voronoi_dilatation,
-        sigma=rod.sigma,
-        rest_sigma=rod.rest_sigma,
-        kappa=rod.kappa,
-        rest_kappa=rod.rest_kappa,
-        shear_matrix=rod.shear_matrix,
-        bend_matrix=rod.bend_matrix,
-        internal_stress=rod.internal_stress,
-        internal_couple=rod.internal_couple,
-        internal_forces=rod.internal_forces,
-        internal_torques=rod.internal_torques,
-        external_forces=rod.external_forces,
-        external_torques=rod.external_torques,
-        mass=rod.mass,
-        inertia=rod.mass_second_moment_of_inertia,
-        inverse_inertia=rod.inv_mass_second_moment_of_inertia,
-        ghost_elements=rod.ghost_elems_idx,
-        ghost_vertices=rod.ghost_voronoi_idx,
-    )
+    return RodArrays(*(getattr(rod, _ITS_NAMES.get(name, name)) for name in RodArrays._fields))
 
 
 class TwinError(RuntimeError):
@@ -256,12 +234,10 @@ class NodeLoads:
         if math.isnan(push.instant) or not push.duration > 0:
             raise TwinError(f"a push needs an instant and a duration above 0 s, got {push}")
         shares = self._shares(push.arc_length)
-        total = self._own_mass + push.mass * shares
-        for other, other_shares in self._pushes:
-            total = total + other.mass * other_shares
-        if np.any(total <= 0.0):
+        hung = [*self._pushes, (push, shares)]
+        if np.any(self._own_mass + sum(each.mass * borne for each, borne in hung) <= 0.0):
             raise TwinError(f"there is no mass of {-push.mass} kg at {push.arc_length} m to take")
-        self._pushes.append((push, shares))
+        self._pushes = hung
 
     def next_change(self, time: float) -> float:
         """Return when the next push begins or ends after a time [s]; infinite for never."""
@@ -290,10 +266,5 @@ class NodeLoads:
             raise TwinError(
                 f"a load at {arc_length} m is not on the limb: its arc length is 0 to {end:.3f} m"
             )
-        place = min(max(arc_length, 0.0), end)
-        index = int(np.clip(np.searchsorted(self._node_arc, place) - 1, 0, len(self._node_arc) - 2))
-        before, after = self._node_arc[index : index + 2]
-        share = (place - before) / (after - before)
-        shares = np.zeros(len(self._node_arc))
-        shares[index : index + 2] = 1.0 - share, share
-        return shares
+        own = np.eye(len(self._node_arc))
+        return np.array([np.interp(arc_length, self._node_arc, node) for node in own])

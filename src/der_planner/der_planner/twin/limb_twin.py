@@ -26,7 +26,6 @@ The board tells its pressures once in that time."""
 _CHAMBER_LIMIT = 2e5
 _SETTLING_DRAG = 8.0
 """Damping [1/s] with which a limb finds its rest: about critical for its first mode."""
-_MANY_STEPS = 1_000_000_000
 _SETTLED_SPEED = 2e-5
 """Largest speed of a node [m/s] of a limb that rests."""
 BACKLOG = 0.25
@@ -143,7 +142,8 @@ class LimbTwin:
         ramp = self._ramp(target, self._ramp_left or steps)
         self._ramp_left = max(0, self._ramp_left - steps)
         while steps:
-            count = min(steps, self._steps_to(self._loads.next_change(self.time)))
+            left = (self._loads.next_change(self.time) - self.time) / TIME_STEP
+            count = math.ceil(min(steps, left))
             drag = self._hardware.drag
             advance(self._arrays, self._material, ramp, self._pegs, count, TIME_STEP, drag)
             ramp = ramp._replace(steps=max(0, ramp.steps - count))
@@ -269,9 +269,8 @@ class LimbTwin:
         return Ramp(steps=steps, **each)
 
     def _settle(self) -> None:
-        rest = np.full(2 * self.segment_count, self.atmosphere)
         steps = int(2.0 / TIME_STEP)
-        ramp = self._ramp(self._target(rest, 0.0), steps // 4)
+        ramp = self._ramp(self._target(self._pressure, 0.0), steps // 4)
         advance(self._arrays, self._material, ramp, self._pegs, steps, TIME_STEP, _SETTLING_DRAG)
         self._stop()
 
@@ -286,8 +285,7 @@ class LimbTwin:
             friction_moment=np.zeros_like(material.friction_moment),
             creep_stiffness=np.zeros_like(material.creep_stiffness),
         )
-        rest = np.full(2 * self.segment_count, self.atmosphere)
-        ramp = self._ramp(self._target(rest, 0.0), 0)
+        ramp = self._ramp(self._target(self._pressure, 0.0), 0)
         steps = round(0.5 / TIME_STEP)
         for _ in range(round(_LONGEST_SETTLING / (steps * TIME_STEP))):
             advance(self._arrays, calm, ramp, self._pegs, steps, TIME_STEP, _SETTLING_DRAG)
@@ -301,11 +299,6 @@ class LimbTwin:
         self._rod.velocity_collection[:] = 0.0
         self._rod.omega_collection[:] = 0.0
         self._material.creep[:] = 0.0
-
-    def _steps_to(self, instant: float) -> int:
-        """Return how many steps lead to an instant [s], at least one."""
-        left = (instant - self.time) / TIME_STEP
-        return math.ceil(left) if left < _MANY_STEPS else _MANY_STEPS
 
     def _element_headings(self) -> Array:
         tangent = self._rod.director_collection[2]
