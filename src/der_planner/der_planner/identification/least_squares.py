@@ -8,6 +8,7 @@ and ρ the square itself or, with ``softness``, a loss that grows like a straigh
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -20,9 +21,6 @@ from der_planner.arrays import Array
 Rows = tuple[Array, Array]
 """Weighted residuals (R,) and their derivatives by the unknowns (R, P)."""
 
-NOT_FOLLOWED = 100.0
-"""Weighted residual of every row where the data function has no answer, which drives the search
-back to a shorter step."""
 TOLERANCE = 1e-3
 """Relative change of the sum of squares at which a search ends: its unknowns then change by less
 than their uncertainty."""
@@ -87,6 +85,7 @@ class LeastSquares:
         self._cheap = cheap
         self._rows, self._softness = rows, softness
         self._last: tuple[bytes, Rows | None] = (b"", None)
+        self._last_summed: tuple[bytes, Rows] = (b"", (np.zeros(0), np.zeros((0, 0))))
 
     def follows(self, values: Array) -> bool:
         """Return whether the model follows with values (P,)."""
@@ -104,21 +103,14 @@ class LeastSquares:
         """
         unknowns = self.unknowns
         begin = unknowns.inside(unknowns.prior if start is None else start)
-        found = self._evaluate(begin)
-        if found is None:
+        if self._evaluate(begin) is None:
             raise ValueError("a fit must begin where its model can be followed")
-        lost = np.full(len(found[0]), NOT_FOLLOWED)
-        known, tightness = unknowns.known, unknowns.scale / unknowns.spread
 
         def residual(x: Array) -> Array:
-            found = self._evaluate(x * unknowns.scale)
-            prior = ((x - unknowns.prior / unknowns.scale) * tightness)[known]
-            return np.concatenate([lost if found is None else found[0], prior])
+            return self._summed(x * unknowns.scale)[0]
 
         def jacobian(x: Array) -> Array:
-            found = self._evaluate(x * unknowns.scale)
-            assert found is not None  # the search never stays where the model is not followed
-            return np.concatenate([found[1] * unknowns.scale, np.diag(tightness)[known]])
+            return self._summed(x * unknowns.scale)[1]
 
         tolerance *= 1e-4 if self._cheap else 1.0
         solution = least_squares(
@@ -126,14 +118,45 @@ class LeastSquares:
             begin / unknowns.scale,
             jac=jacobian,
             bounds=(unknowns.low / unknowns.scale, unknowns.high / unknowns.scale),
-            loss="linear" if self._softness is None else "soft_l1",
-            f_scale=self._softness or 1.0,
             x_scale=1.0 if self._cheap else "jac",
             xtol=10.0 * tolerance,
             ftol=tolerance,
             max_nfev=10 * MOST_EVALUATIONS if self._cheap else MOST_EVALUATIONS,
         )
         return np.asarray(solution.x * unknowns.scale)
+
+    def _summed(self, values: Array) -> Rows:
+        """Return P + 1 rows that stand for those of the data and the prior, in the search's scale.
+
+        Their sum of squares is that of all rows under the loss, and gradient and matrix of Gauss
+        and Newton are theirs. The search takes singular values of its rows: of thousands that would
+        take longer than a simulation. Rows that the model cannot follow are NaN, which drives the
+        search back to a shorter step.
+        """
+        key = same_values(values, self.unknowns)
+        if self._last_summed[0] != key:
+            self._last_summed = key, self._sum(values)
+        return self._last_summed[1]
+
+    def _sum(self, values: Array) -> Rows:
+        found, unknowns, count = self._evaluate(values), self.unknowns, len(values)
+        if found is None:
+            return np.full(count + 1, np.nan), np.zeros((count + 1, count))
+        known, tightness = unknowns.known, unknowns.scale / unknowns.spread
+        prior = (values - unknowns.prior) / unknowns.spread
+        residual = np.concatenate([found[0], prior[known]])
+        slopes = np.concatenate([found[1] * unknowns.scale, np.diag(tightness)[known]])
+        if self._softness is None:
+            weight, total = np.ones(len(residual)), float(residual @ residual)
+        else:
+            growth = np.sqrt(1.0 + (residual / self._softness) ** 2)
+            weight, total = 1.0 / growth, 2.0 * self._softness**2 * float(np.sum(growth - 1.0))
+        weighed = weight[:, None] * slopes
+        squares, ways = np.linalg.eigh(slopes.T @ weighed)
+        sizes = np.sqrt(np.maximum(squares, 1e-15 * squares[-1] + 1e-300))
+        along = ways.T @ (weighed.T @ residual) / sizes
+        left = math.sqrt(max(total - float(along @ along), 0.0))
+        return np.append(along, left), np.vstack([sizes[:, None] * ways.T, np.zeros(count)])
 
     def covariance(self, values: Array, factor: float = 1.0) -> Array:
         """Return the covariance (P, P) of values that were found.

@@ -93,13 +93,14 @@ def _factors(columns: Array, values: Array) -> tuple[Array, float]:
     """
     scale, weight = np.abs(columns).max(axis=0, initial=1e-30), np.ones(len(values))
     for _ in range(ROUNDS):
-        inverse = np.linalg.pinv(weight[:, None] * columns / scale)
-        factors = inverse @ (weight * values) / scale
+        weighed = weight[:, None] * columns / scale
+        inverse = np.linalg.pinv(weighed.T @ weighed, hermitian=True)
+        factors = inverse @ (weighed.T @ (weight * values)) / scale
         left = values - columns @ factors
         weight = 1.0 / np.hypot(1.0, left / (OUTLYING * np.median(np.abs(left)) + 1e-30))
     # Smoothing makes what is left of so many rows alike.
     variance = 2.0 * np.sqrt(np.pi) * SMOOTHED * np.mean((weight * left) ** 2)
-    return factors[:2], float(np.sqrt(variance * np.sum(inverse[0] ** 2)) / scale[0])
+    return factors[:2], float(np.sqrt(variance * inverse[0, 0]) / scale[0])
 
 
 def _inertia(limb: Limb, bend: Array, change: Array) -> Array:
