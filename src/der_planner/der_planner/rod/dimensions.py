@@ -28,18 +28,10 @@ class PlanarBackend(Backend):
     def __init__(self, mesh: Mesh, plane: str) -> None:
         axis = {"xy": 1, "xz": 2}[plane]
         super().__init__(mesh, (4 * np.arange(mesh.nodes)[:, None] + np.array([0, axis])).ravel())
-        first, last = self.segment_edges()
         self.rod = PlanarRod(
-            rest=np.concatenate([mesh.rest[: int(mesh.ghost)], mesh.rest]),
-            axial=self.ghosted(mesh.axial),
-            bend=self.ghosted(mesh.bend),
+            **self.numbers(),
             rest_kappa=self.ghosted(mesh.rest_kappa[:, axis - 1]),
-            cubic=self.ghosted(mesh.cubic),
-            viscous=self.ghosted(mesh.viscous),
-            first=first,
-            last=last,
             gain=mesh.gain if plane == "xy" else np.zeros_like(mesh.gain),
-            body=self.body(),
         )
 
     def work_space(self, base: Base = _NO_FRAMES) -> PlanarSpace:  # noqa: ARG002 - no frames
@@ -102,20 +94,12 @@ class SpatialBackend(Backend):
         super().__init__(mesh, np.arange(4 * mesh.nodes - 1))
         self.turning_edges = mesh.nodes - 1 + int(mesh.ghost)
         self.lever = 0.1 * float(mesh.rest.sum())
-        first, last = self.segment_edges()
         self.rod = SpatialRod(
-            rest=np.concatenate([mesh.rest[: int(mesh.ghost)], mesh.rest]),
-            axial=self.ghosted(mesh.axial),
-            bend=self.ghosted(mesh.bend),
+            **self.numbers(),
             twist=self.ghosted(mesh.twist),
-            cubic=self.ghosted(mesh.cubic),
-            viscous=self.ghosted(mesh.viscous),
             rest_kappa=self.ghosted(mesh.rest_kappa),
             rest_twist=self.ghosted(mesh.rest_twist),
-            first=first,
-            last=last,
             gain=mesh.gain,
-            body=self.body(),
         )
 
     def work_space(self, base: Base) -> SpatialSpace:
