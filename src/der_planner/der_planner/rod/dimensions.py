@@ -14,7 +14,7 @@ from der_planner.rod.spatial import assembly_kernel as spatial_assembly
 from der_planner.rod.spatial import elastic_kernel as spatial_elastic
 from der_planner.rod.spatial import step_kernel as spatial_step
 from der_planner.rod.spatial.elastic_kernel import SpatialRod, SpatialSpace
-from der_planner.rod.step_kernel import Base
+from der_planner.rod.step_kernel import Base, input_columns
 
 _NO_FRAMES = Base(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
 
@@ -80,7 +80,7 @@ class PlanarBackend(Backend):
         """Return B(q)Λ (4N-1, M)."""
         columns, space = np.zeros((self.size, len(self.mesh.gain))), self.work_space()
         planar_elastic.edges_and_turns(self.unknowns(state.q), space.edge, space.turn)
-        planar_elastic.input_columns(space.edge, self.rod, columns)
+        input_columns(space.edge, 2, self.rod, columns)
         return self.full(columns)
 
 
@@ -158,7 +158,7 @@ class SpatialBackend(Backend):
     def input_matrix(self, state: RodState) -> Array:
         """Return B(q)Λ (4N-1, M)."""
         columns = np.zeros((self.size, len(self.mesh.gain)))
-        spatial_elastic.input_columns(self._framed(state)[1].frame, self.rod, columns)
+        input_columns(self._framed(state)[1].frame, 4, self.rod, columns)
         return self.full(columns)
 
     def _framed(self, state: RodState) -> tuple[Array, SpatialSpace]:

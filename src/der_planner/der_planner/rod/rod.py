@@ -235,9 +235,8 @@ class Rod:
         Raises:
             ConvergenceError: Newton's iteration failed.
         """
-        pressures = array(u, (self.segment_count,), "u")[None, None, :]
-        load = self._load(forces)
-        motion, _ = self._integrator.run(state, pressures, positive(dt, "dt"), method, load)
+        pressures = array(u, (self.segment_count,), "u")[None]
+        motion = self.simulate(state, pressures, dt, method=method, forces=forces, halvings=0)
         return motion.final
 
     def simulate(
