@@ -84,12 +84,11 @@ class LeastSquares:
         self.unknowns = unknowns
         self._cheap = cheap
         self._rows, self._softness = rows, softness
-        self._last: tuple[bytes, Rows | None] = (b"", None)
-        self._last_summed: tuple[bytes, Rows] = (b"", (np.zeros(0), np.zeros((0, 0))))
+        self._last: tuple[bytes, Rows] = (b"", (np.zeros(0), np.zeros((0, 0))))
 
     def follows(self, values: Array) -> bool:
         """Return whether the model follows with values (P,)."""
-        return self._evaluate(self.unknowns.inside(values)) is not None
+        return bool(np.isfinite(self._summed(self.unknowns.inside(values))[0]).all())
 
     def solve(self, start: Array | None = None, tolerance: float = TOLERANCE) -> Array:
         """Return the best values (P,).
@@ -103,7 +102,7 @@ class LeastSquares:
         """
         unknowns = self.unknowns
         begin = unknowns.inside(unknowns.prior if start is None else start)
-        if self._evaluate(begin) is None:
+        if not self.follows(begin):
             raise ValueError("a fit must begin where its model can be followed")
 
         def residual(x: Array) -> Array:
@@ -134,13 +133,13 @@ class LeastSquares:
         search back to a shorter step.
         """
         key = same_values(values, self.unknowns)
-        if self._last_summed[0] != key:
-            self._last_summed = key, self._sum(values)
-        return self._last_summed[1]
+        if self._last[0] != key:
+            self._last = key, self._sum(values)
+        return self._last[1]
 
     def _sum(self, values: Array) -> Rows:
-        found, unknowns, count = self._evaluate(values), self.unknowns, len(values)
-        if found is None:
+        found, unknowns, count = self._rows(values), self.unknowns, len(values)
+        if found is None or not np.isfinite(found[0]).all():
             return np.full(count + 1, np.nan), np.zeros((count + 1, count))
         known, tightness = unknowns.known, unknowns.scale / unknowns.spread
         prior = (values - unknowns.prior) / unknowns.spread
@@ -166,22 +165,13 @@ class LeastSquares:
             factor: by which the data's variance is larger than their weights say.
         """
         unknowns = self.unknowns
-        found = self._evaluate(values)
+        found = self._rows(values)
         assert found is not None
         slopes = found[1] * unknowns.scale
         prior = np.where(unknowns.known, unknowns.scale / unknowns.spread, 0.0)
         information = slopes.T @ slopes / max(factor, 1e-6) + np.diag(prior**2)
         covariance = np.linalg.pinv(information, hermitian=True)
         return np.asarray(covariance * np.outer(unknowns.scale, unknowns.scale))
-
-    def _evaluate(self, values: Array) -> Rows | None:
-        """Return the rows at values (P,), or None; the last ones are kept."""
-        key = same_values(values, self.unknowns)
-        if self._last[0] != key:
-            found = self._rows(values)
-            followed = found is not None and bool(np.all(np.isfinite(found[0])))
-            self._last = (key, found if followed else None)
-        return self._last[1]
 
 
 def same_values(values: Array, unknowns: Unknowns) -> bytes:
