@@ -70,7 +70,7 @@ class LeastSquares:
             model cannot follow.
         softness: weighted residual from which on errors count less than their square; None: never.
         cheap: the rows take no time, so that the search goes on to the last digit, in steps as
-            large as the unknowns' scales say, not their derivatives.
+            large as the unknowns' scales say, not their derivatives, and sees each row.
     """
 
     def __init__(
@@ -88,7 +88,7 @@ class LeastSquares:
 
     def follows(self, values: Array) -> bool:
         """Return whether the model follows with values (P,)."""
-        return bool(np.isfinite(self._summed(self.unknowns.inside(values))[0]).all())
+        return bool(np.isfinite(self._all_rows(self.unknowns.inside(values))[0]).all())
 
     def solve(self, start: Array | None = None, tolerance: float = TOLERANCE) -> Array:
         """Return the best values (P,).
@@ -105,11 +105,13 @@ class LeastSquares:
         if not self.follows(begin):
             raise ValueError("a fit must begin where its model can be followed")
 
+        rows = self._all_rows if self._cheap else self._summed
+
         def residual(x: Array) -> Array:
-            return self._summed(x * unknowns.scale)[0]
+            return rows(x * unknowns.scale)[0]
 
         def jacobian(x: Array) -> Array:
-            return self._summed(x * unknowns.scale)[1]
+            return rows(x * unknowns.scale)[1]
 
         tolerance *= 1e-4 if self._cheap else 1.0
         solution = least_squares(
@@ -117,6 +119,8 @@ class LeastSquares:
             begin / unknowns.scale,
             jac=jacobian,
             bounds=(unknowns.low / unknowns.scale, unknowns.high / unknowns.scale),
+            loss="soft_l1" if self._cheap and self._softness else "linear",
+            f_scale=self._softness or 1.0,
             x_scale=1.0 if self._cheap else "jac",
             xtol=10.0 * tolerance,
             ftol=tolerance,
@@ -124,38 +128,41 @@ class LeastSquares:
         )
         return np.asarray(solution.x * unknowns.scale)
 
-    def _summed(self, values: Array) -> Rows:
-        """Return P + 1 rows that stand for those of the data and the prior, in the search's scale.
+    def _all_rows(self, values: Array) -> Rows:
+        """Return the rows of the data and of the prior at values (P,), in the search's scale.
 
-        Their sum of squares is that of all rows under the loss, and gradient and matrix of Gauss
-        and Newton are theirs. The search takes singular values of its rows: of thousands that would
-        take longer than a simulation. Rows that the model cannot follow are NaN, which drives the
-        search back to a shorter step.
+        Rows that the model cannot follow are NaN, which drives the search to a shorter step.
         """
-        key = same_values(values, self.unknowns)
+        unknowns, key = self.unknowns, same_values(values, self.unknowns)
         if self._last[0] != key:
-            self._last = key, self._sum(values)
+            found = self._rows(values) or (np.full(1, np.nan), np.zeros((1, len(values))))
+            known, tightness = unknowns.known, unknowns.scale / unknowns.spread
+            prior = (values - unknowns.prior) / unknowns.spread
+            residual = np.concatenate([found[0], prior[known]])
+            slopes = np.concatenate([found[1] * unknowns.scale, np.diag(tightness)[known]])
+            self._last = key, (residual, slopes)
         return self._last[1]
 
-    def _sum(self, values: Array) -> Rows:
-        found, unknowns, count = self._rows(values), self.unknowns, len(values)
-        if found is None or not np.isfinite(found[0]).all():
-            return np.full(count + 1, np.nan), np.zeros((count + 1, count))
-        known, tightness = unknowns.known, unknowns.scale / unknowns.spread
-        prior = (values - unknowns.prior) / unknowns.spread
-        residual = np.concatenate([found[0], prior[known]])
-        slopes = np.concatenate([found[1] * unknowns.scale, np.diag(tightness)[known]])
-        if self._softness is None:
-            weight, total = np.ones(len(residual)), float(residual @ residual)
-        else:
+    def _summed(self, values: Array) -> Rows:
+        """Return P + 1 rows that stand for all, the loss included.
+
+        Their sum of squares is that of all rows under the loss, and so are gradient and matrix of
+        Gauss and Newton. The search takes singular values of its rows: of thousands that would
+        take longer than a simulation.
+        """
+        residual, slopes = self._all_rows(values)
+        if not np.isfinite(residual).all():
+            return np.full(len(values) + 1, np.nan), np.zeros((len(values) + 1, len(values)))
+        growth, total = np.ones(len(residual)), float(residual @ residual)
+        if self._softness is not None:
             growth = np.sqrt(1.0 + (residual / self._softness) ** 2)
-            weight, total = 1.0 / growth, 2.0 * self._softness**2 * float(np.sum(growth - 1.0))
-        weighed = weight[:, None] * slopes
+            total = 2.0 * self._softness**2 * float(np.sum(growth - 1.0))
+        weighed = slopes / growth[:, None]
         squares, ways = np.linalg.eigh(slopes.T @ weighed)
         sizes = np.sqrt(np.maximum(squares, 1e-15 * squares[-1] + 1e-300))
         along = ways.T @ (weighed.T @ residual) / sizes
         left = math.sqrt(max(total - float(along @ along), 0.0))
-        return np.append(along, left), np.vstack([sizes[:, None] * ways.T, np.zeros(count)])
+        return np.append(along, left), np.vstack([sizes[:, None] * ways.T, np.zeros(len(values))])
 
     def covariance(self, values: Array, factor: float = 1.0) -> Array:
         """Return the covariance (P, P) of values that were found.
