@@ -5,7 +5,7 @@ from link_chain import LinkChain
 
 from der_planner.identification.excitation import calibration_run
 from der_planner.identification.log import prepare
-from der_planner.identification.motion import stiffness_in_motion
+from der_planner.identification.stiffness import stiffness_in_motion
 from der_planner.limb import Limb
 
 LIMB = Limb.default()

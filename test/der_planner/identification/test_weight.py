@@ -8,7 +8,7 @@ from limbs import with_segments
 
 from der_planner.identification import CalibrationLog, LogError
 from der_planner.identification.log import Prepared
-from der_planner.identification.weight import HungWeight
+from der_planner.identification.stiffness import HungWeight
 from der_planner.limb import Limb, PointMass
 from der_planner.model import RodModel
 

@@ -138,7 +138,7 @@ def test_the_linearisation_of_a_cut_step_is_its_derivative(kind, monkeypatch):
     with pytest.raises(ConvergenceError, match=r"step 1 of 0\.1 s"):
         rod.simulate(start, u, 0.1, method="backward_euler", halvings=0)
     run = rod.simulate(start, u, 0.1, method="backward_euler", linearise=True)
-    solves = np.bincount(run.linearisation.solved.steps, minlength=4)
+    solves = np.bincount(run.linearisation.chain.steps, minlength=4)
     assert solves[0] == 1
     assert solves[1] > 1
     change = np.random.default_rng(8).normal(size=u.shape)

@@ -69,7 +69,7 @@ from der_planner.identification.foreign import ask_map, is_bag
 from der_planner.identification.log import prepare
 from der_planner.identification.readers import is_ours, read_table
 from der_planner.identification.report import plot_prediction
-from der_planner.identification.weight import FREE, REST
+from der_planner.identification.stiffness import FREE, REST
 from der_planner.limb import Limb, LimbError
 from der_planner.planning.loads import nearly_buckling
 from pressure_driver.settings import Settings

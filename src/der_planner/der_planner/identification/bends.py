@@ -22,6 +22,7 @@ from scipy.ndimage import binary_erosion, uniform_filter1d
 
 from der_planner.arrays import Array
 from der_planner.identification.least_squares import (
+    TOLERANCE,
     LeastSquares,
     Rows,
     Unknowns,
@@ -72,12 +73,10 @@ SOFTNESS = 3.0
 """Errors beyond this multiple of the usual one count less than their square."""
 ROUGH = 3e-2
 """Relative change of the sum of squares at which a search ends whose weights are not known yet."""
-SAME_WEIGHT = math.log(1.25)
+SAME_WEIGHT = math.log(1.1)
 """Change of the logarithm of an error up to which a search need not be repeated."""
 MOST_FITS = 3
-"""Largest number of searches, each with the weights that the last one told."""
-_STEPS = {"der": 1, "pcc": 2}
-"""Integrator steps in each row of 50 ms; the page of the identification shows the convergence."""
+"""Largest number of searches with weights that an earlier one told."""
 _NUDGE = 1e-3
 """Change of an unknown, in units of its scale, for the slope of the effective pressure."""
 _STEP = 0.1
@@ -249,8 +248,7 @@ def follow(model: Model, log: Prepared, *, linearise: bool = False) -> Response:
     Raises:
         RuntimeError: it cannot follow, or does not come to rest.
     """
-    steps = _STEPS[model.name]
-    return simulate(model, log.log.time, pressures=log.pressure, steps=steps, linearise=linearise)
+    return simulate(model, log.log.time, pressures=log.pressure, steps=1, linearise=linearise)
 
 
 def predicted(free: FreeTerms, model: Model, log: Prepared, values: Array) -> Predicted:
@@ -332,11 +330,13 @@ class BendFit:
         self._bends_on = [_bends_on(free.limb, log) for log in logs]
         self._shaken = [_shaken(free.limb, log) for log in logs]
         self.weigh(np.full((3, free.limb.segment_count), ANGLE_ERROR))
+        self._weighed = False
 
     def weigh(self, errors: Array) -> None:
         """Take errors (3, M) of bend angles for granted, see `LEAST_ERRORS` [rad]."""
         self.errors = np.maximum(errors, 1e-3 * ANGLE_ERROR)
         self.errors[2] = np.maximum(errors[2], SHAKEN_WORSE * errors[0])
+        self._weighed = True
         unknowns = self.free.unknowns
         self.search = LeastSquares(unknowns, self._rows, SOFTNESS / np.sqrt(CORRELATION))
 
@@ -344,7 +344,8 @@ class BendFit:
         """Return the best values (P,), the bend angles weighed by the errors that these leave.
 
         With the errors taken for granted, a log that the model cannot explain would outweigh
-        everything that is known before it, and move what it does not tell.
+        everything that is known before it, and move what it does not tell. Errors that were
+        weighed before, as another fit to the log left them, save the rough search.
 
         Args:
             start: (P,) that the model follows.
@@ -352,13 +353,12 @@ class BendFit:
         Raises:
             ValueError: the model cannot be followed at the start.
         """
-        values = self.search.solve(start, ROUGH)
-        errors = np.maximum(self.errors_left(values), LEAST_ERRORS)
-        for _ in range(MOST_FITS):
-            self.weigh(errors)
-            values = self.search.solve(values)
-            errors = np.maximum(self.errors_left(values), LEAST_ERRORS)
-            if np.abs(np.log(errors / self.errors)).max() < SAME_WEIGHT:
+        values = start
+        for _ in range(1 + MOST_FITS):
+            values = self.search.solve(values, TOLERANCE if self._weighed else ROUGH)
+            before, known = self.errors, self._weighed
+            self.weigh(np.maximum(self.errors_left(values), LEAST_ERRORS))
+            if known and np.abs(np.log(self.errors / before)).max() < SAME_WEIGHT:
                 break
         return values
 
@@ -403,11 +403,20 @@ class BendFit:
         Raises:
             RuntimeError: the model cannot follow the logs.
         """
-        model = self._model.another(self.free.limb_with(values))
-        errors = [log.log.bend_angles - follow(model, log).bend_angles for log in self._logs]
-        for error, log in zip(errors, self._logs, strict=True):
-            error[~log.usable] = np.nan
-        return np.concatenate(errors)
+        key = same_values(values, self.free.unknowns)
+        found = self._last[1] if self._last[0] == key else None
+        if found is None:
+            model = self._model.another(self.free.limb_with(values))
+            angles = [follow(model, log).bend_angles for log in self._logs]
+        else:
+            angles = [part.angles for part in found]
+        pairs = zip(self._logs, angles, strict=True)
+        return np.concatenate(
+            [
+                np.where(log.usable[:, None], log.log.bend_angles - bent, np.nan)
+                for log, bent in pairs
+            ]
+        )
 
     def errors_left(self, values: Array) -> Array:
         """Return the errors (3, M) [rad] that values (P,) leave, see `LEAST_ERRORS`.

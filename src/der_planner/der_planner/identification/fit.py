@@ -38,10 +38,9 @@ from der_planner.identification.log import (
     Prepared,
     prepare,
 )
-from der_planner.identification.motion import stiffness_in_motion
 from der_planner.identification.report import FitReport
+from der_planner.identification.stiffness import HungWeight, stiffness_in_motion
 from der_planner.identification.told import at_bounds, kept_unknowns, told, untold_stiffness
-from der_planner.identification.weight import HungWeight
 from der_planner.limb import CalibratedRange, Limb
 from der_planner.model import ArcModel, Material, RodModel
 from der_planner.planning.loads import nearly_buckling

@@ -8,6 +8,7 @@ and ρ the square itself or, with ``softness``, a loss that grows like a straigh
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -20,9 +21,6 @@ from der_planner.arrays import Array
 Rows = tuple[Array, Array]
 """Weighted residuals (R,) and their derivatives by the unknowns (R, P)."""
 
-NOT_FOLLOWED = 100.0
-"""Weighted residual of every row where the data function has no answer, which drives the search
-back to a shorter step."""
 TOLERANCE = 1e-3
 """Relative change of the sum of squares at which a search ends: its unknowns then change by less
 than their uncertainty."""
@@ -72,7 +70,7 @@ class LeastSquares:
             model cannot follow.
         softness: weighted residual from which on errors count less than their square; None: never.
         cheap: the rows take no time, so that the search goes on to the last digit, in steps as
-            large as the unknowns' scales say, not their derivatives.
+            large as the unknowns' scales say, not their derivatives, and sees each row.
     """
 
     def __init__(
@@ -86,11 +84,11 @@ class LeastSquares:
         self.unknowns = unknowns
         self._cheap = cheap
         self._rows, self._softness = rows, softness
-        self._last: tuple[bytes, Rows | None] = (b"", None)
+        self._last: tuple[bytes, Rows] = (b"", (np.zeros(0), np.zeros((0, 0))))
 
     def follows(self, values: Array) -> bool:
         """Return whether the model follows with values (P,)."""
-        return self._evaluate(self.unknowns.inside(values)) is not None
+        return bool(np.isfinite(self._all_rows(self.unknowns.inside(values))[0]).all())
 
     def solve(self, start: Array | None = None, tolerance: float = TOLERANCE) -> Array:
         """Return the best values (P,).
@@ -104,21 +102,16 @@ class LeastSquares:
         """
         unknowns = self.unknowns
         begin = unknowns.inside(unknowns.prior if start is None else start)
-        found = self._evaluate(begin)
-        if found is None:
+        if not self.follows(begin):
             raise ValueError("a fit must begin where its model can be followed")
-        lost = np.full(len(found[0]), NOT_FOLLOWED)
-        known, tightness = unknowns.known, unknowns.scale / unknowns.spread
+
+        rows = self._all_rows if self._cheap else self._summed
 
         def residual(x: Array) -> Array:
-            found = self._evaluate(x * unknowns.scale)
-            prior = ((x - unknowns.prior / unknowns.scale) * tightness)[known]
-            return np.concatenate([lost if found is None else found[0], prior])
+            return rows(x * unknowns.scale)[0]
 
         def jacobian(x: Array) -> Array:
-            found = self._evaluate(x * unknowns.scale)
-            assert found is not None  # the search never stays where the model is not followed
-            return np.concatenate([found[1] * unknowns.scale, np.diag(tightness)[known]])
+            return rows(x * unknowns.scale)[1]
 
         tolerance *= 1e-4 if self._cheap else 1.0
         solution = least_squares(
@@ -126,7 +119,7 @@ class LeastSquares:
             begin / unknowns.scale,
             jac=jacobian,
             bounds=(unknowns.low / unknowns.scale, unknowns.high / unknowns.scale),
-            loss="linear" if self._softness is None else "soft_l1",
+            loss="soft_l1" if self._cheap and self._softness else "linear",
             f_scale=self._softness or 1.0,
             x_scale=1.0 if self._cheap else "jac",
             xtol=10.0 * tolerance,
@@ -134,6 +127,42 @@ class LeastSquares:
             max_nfev=10 * MOST_EVALUATIONS if self._cheap else MOST_EVALUATIONS,
         )
         return np.asarray(solution.x * unknowns.scale)
+
+    def _all_rows(self, values: Array) -> Rows:
+        """Return the rows of the data and of the prior at values (P,), in the search's scale.
+
+        Rows that the model cannot follow are NaN, which drives the search to a shorter step.
+        """
+        unknowns, key = self.unknowns, same_values(values, self.unknowns)
+        if self._last[0] != key:
+            found = self._rows(values) or (np.full(1, np.nan), np.zeros((1, len(values))))
+            known, tightness = unknowns.known, unknowns.scale / unknowns.spread
+            prior = (values - unknowns.prior) / unknowns.spread
+            residual = np.concatenate([found[0], prior[known]])
+            slopes = np.concatenate([found[1] * unknowns.scale, np.diag(tightness)[known]])
+            self._last = key, (residual, slopes)
+        return self._last[1]
+
+    def _summed(self, values: Array) -> Rows:
+        """Return P + 1 rows that stand for all, the loss included.
+
+        Their sum of squares is that of all rows under the loss, and so are gradient and matrix of
+        Gauss and Newton. The search takes singular values of its rows: of thousands that would
+        take longer than a simulation.
+        """
+        residual, slopes = self._all_rows(values)
+        if not np.isfinite(residual).all():
+            return np.full(len(values) + 1, np.nan), np.zeros((len(values) + 1, len(values)))
+        growth, total = np.ones(len(residual)), float(residual @ residual)
+        if self._softness is not None:
+            growth = np.sqrt(1.0 + (residual / self._softness) ** 2)
+            total = 2.0 * self._softness**2 * float(np.sum(growth - 1.0))
+        weighed = slopes / growth[:, None]
+        squares, ways = np.linalg.eigh(slopes.T @ weighed)
+        sizes = np.sqrt(np.maximum(squares, 1e-15 * squares[-1] + 1e-300))
+        along = ways.T @ (weighed.T @ residual) / sizes
+        left = math.sqrt(max(total - float(along @ along), 0.0))
+        return np.append(along, left), np.vstack([sizes[:, None] * ways.T, np.zeros(len(values))])
 
     def covariance(self, values: Array, factor: float = 1.0) -> Array:
         """Return the covariance (P, P) of values that were found.
@@ -143,22 +172,13 @@ class LeastSquares:
             factor: by which the data's variance is larger than their weights say.
         """
         unknowns = self.unknowns
-        found = self._evaluate(values)
+        found = self._rows(values)
         assert found is not None
         slopes = found[1] * unknowns.scale
         prior = np.where(unknowns.known, unknowns.scale / unknowns.spread, 0.0)
         information = slopes.T @ slopes / max(factor, 1e-6) + np.diag(prior**2)
         covariance = np.linalg.pinv(information, hermitian=True)
         return np.asarray(covariance * np.outer(unknowns.scale, unknowns.scale))
-
-    def _evaluate(self, values: Array) -> Rows | None:
-        """Return the rows at values (P,), or None; the last ones are kept."""
-        key = same_values(values, self.unknowns)
-        if self._last[0] != key:
-            found = self._rows(values)
-            followed = found is not None and bool(np.all(np.isfinite(found[0])))
-            self._last = (key, found if followed else None)
-        return self._last[1]
 
 
 def same_values(values: Array, unknowns: Unknowns) -> bytes:

@@ -11,7 +11,7 @@ import numpy as np
 from der_planner.arrays import Array
 from der_planner.identification.air import AirFit
 from der_planner.identification.lengths import GeometryFit
-from der_planner.identification.log import CalibrationLog, LogError, bridge, prepare
+from der_planner.identification.log import LEAST_MOTION, CalibrationLog, LogError, bridge, prepare
 from der_planner.limb import Limb
 from der_planner.limb.parameters import REST_SPREAD
 from der_planner.model import CONTROL_PERIOD, Model, Response, simulate
@@ -27,8 +27,6 @@ LEAST_ERROR = math.radians(0.4)
 """Least error of a calibration that `ERROR_GROWTH` multiplies [rad]."""
 STRONG = 0.9
 """|correlation| above which two unknowns are reported as a pair that the log cannot tell apart."""
-LEAST_MOTION = math.radians(3.0)
-"""Predicted range of motion above which the gain is checked [rad]."""
 
 
 @dataclass(frozen=True)

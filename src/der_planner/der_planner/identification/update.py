@@ -29,8 +29,8 @@ from der_planner.identification.bends import (
     values_of,
 )
 from der_planner.identification.least_squares import LeastSquares, Rows, with_differences
-from der_planner.identification.log import CalibrationLog, LogError, Prepared, prepare
-from der_planner.identification.report import LEAST_MOTION, readable
+from der_planner.identification.log import LEAST_MOTION, CalibrationLog, LogError, Prepared, prepare
+from der_planner.identification.report import readable
 from der_planner.identification.told import UNTOLD
 from der_planner.limb import Limb, Term
 from der_planner.limb.parameters import REST_SPREAD

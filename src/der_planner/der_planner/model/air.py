@@ -91,15 +91,14 @@ class Air:
         differential = middle.reshape(-1, steps, middle.shape[1])
         return Chambers(self, period, steps, start, differential, pair, target)
 
-    def pressures_at_commands(self, command: Array, period: float, steps: int = 2) -> Array:
+    def pressures_at_commands(self, command: Array, period: float) -> Array:
         """Return the differential pressures (K, M) [Pa] at the instants of commands (K, M) [Pa].
 
-        They are read off straight lines between the middles of ``steps`` steps a period.
+        They are read off straight lines between instants a quarter of a period after each.
         """
-        middle = self.follow(command, period, steps).differential[:, 0]
-        # The middle of the first step comes half a step after the instant.
+        middle = self.follow(command, period, 2).differential[:, 0]
         instants = np.arange(len(command)) * period
-        return interpolate(instants, instants + 0.5 * period / steps, middle)
+        return interpolate(instants, instants + 0.25 * period, middle)
 
     def even_pulse(self, period: float, steps: int) -> Array:
         """Return the change (R,) of the pressure in the steps after one command rises by one [-].

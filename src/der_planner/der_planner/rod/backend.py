@@ -150,16 +150,24 @@ class Backend(ABC):
 
     # ------------------------------------------------------------------------------ coordinates
 
-    def ghosted(self, values: Array, ghost: float = 0.0) -> Array:
-        """Return values of edges or nodes with one more for what the ghost clamp adds."""
-        added = np.full((int(self.mesh.ghost), *values.shape[1:]), ghost)
-        return np.concatenate([added, values])
+    def ghosted(self, values: Array) -> Array:
+        """Return values of edges or nodes after a zero for what the ghost clamp adds."""
+        return np.concatenate([np.zeros((int(self.mesh.ghost), *values.shape[1:])), values])
 
-    def segment_edges(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the first and the last edge of each segment (M,), counted with the ghost's."""
-        pairs = np.array(self.mesh.segments, dtype=np.int64).reshape(-1, 2)
-        first = pairs[:, 0] + int(self.mesh.ghost)
-        return first, first + pairs[:, 1] - 2
+    def numbers(self) -> dict[str, Any]:
+        """Return the numbers that all rods have alike, with those of the ghost's edge or node."""
+        mesh, ghost = self.mesh, int(self.mesh.ghost)
+        first, count = np.array(mesh.segments, dtype=np.int64).reshape(-1, 2).T
+        of_nodes = {
+            name: self.ghosted(getattr(mesh, name)) for name in ("bend", "cubic", "viscous")
+        }
+        return of_nodes | {
+            "rest": np.concatenate([mesh.rest[:ghost], mesh.rest]),
+            "axial": self.ghosted(mesh.axial),
+            "first": first + ghost,
+            "last": first + ghost + count - 2,
+            "body": Body(self.mass, self.damping, np.zeros(self.size), self.fixed),
+        }
 
     def unknowns(self, q: Array) -> Array:
         """Return the kernels' coordinates (n,) of q (4N-1,)."""
@@ -209,10 +217,6 @@ class Backend(ABC):
     def loaded(self, load: Array) -> Any:
         """Return the numbers of the rod under a load (4N-1,) [N]."""
         return self.rod._replace(body=self.rod.body._replace(load=self.rates(load)))
-
-    def body(self) -> Body:
-        """Return what moves, without a load."""
-        return Body(self.mass, self.damping, np.zeros(self.size), self.fixed)
 
     def new_record(self, solves: int) -> Record:
         """Return an unfilled record of so many solves."""

@@ -14,7 +14,7 @@ from der_planner.rod.spatial import assembly_kernel as spatial_assembly
 from der_planner.rod.spatial import elastic_kernel as spatial_elastic
 from der_planner.rod.spatial import step_kernel as spatial_step
 from der_planner.rod.spatial.elastic_kernel import SpatialRod, SpatialSpace
-from der_planner.rod.step_kernel import Base
+from der_planner.rod.step_kernel import Base, input_columns
 
 _NO_FRAMES = Base(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
 
@@ -28,18 +28,10 @@ class PlanarBackend(Backend):
     def __init__(self, mesh: Mesh, plane: str) -> None:
         axis = {"xy": 1, "xz": 2}[plane]
         super().__init__(mesh, (4 * np.arange(mesh.nodes)[:, None] + np.array([0, axis])).ravel())
-        first, last = self.segment_edges()
         self.rod = PlanarRod(
-            rest=np.concatenate([mesh.rest[: int(mesh.ghost)], mesh.rest]),
-            axial=self.ghosted(mesh.axial),
-            bend=self.ghosted(mesh.bend),
+            **self.numbers(),
             rest_kappa=self.ghosted(mesh.rest_kappa[:, axis - 1]),
-            cubic=self.ghosted(mesh.cubic),
-            viscous=self.ghosted(mesh.viscous),
-            first=first,
-            last=last,
             gain=mesh.gain if plane == "xy" else np.zeros_like(mesh.gain),
-            body=self.body(),
         )
 
     def work_space(self, base: Base = _NO_FRAMES) -> PlanarSpace:  # noqa: ARG002 - no frames
@@ -88,7 +80,7 @@ class PlanarBackend(Backend):
         """Return B(q)Λ (4N-1, M)."""
         columns, space = np.zeros((self.size, len(self.mesh.gain))), self.work_space()
         planar_elastic.edges_and_turns(self.unknowns(state.q), space.edge, space.turn)
-        planar_elastic.input_columns(space.edge, self.rod, columns)
+        input_columns(space.edge, 2, self.rod, columns)
         return self.full(columns)
 
 
@@ -102,20 +94,12 @@ class SpatialBackend(Backend):
         super().__init__(mesh, np.arange(4 * mesh.nodes - 1))
         self.turning_edges = mesh.nodes - 1 + int(mesh.ghost)
         self.lever = 0.1 * float(mesh.rest.sum())
-        first, last = self.segment_edges()
         self.rod = SpatialRod(
-            rest=np.concatenate([mesh.rest[: int(mesh.ghost)], mesh.rest]),
-            axial=self.ghosted(mesh.axial),
-            bend=self.ghosted(mesh.bend),
+            **self.numbers(),
             twist=self.ghosted(mesh.twist),
-            cubic=self.ghosted(mesh.cubic),
-            viscous=self.ghosted(mesh.viscous),
             rest_kappa=self.ghosted(mesh.rest_kappa),
             rest_twist=self.ghosted(mesh.rest_twist),
-            first=first,
-            last=last,
             gain=mesh.gain,
-            body=self.body(),
         )
 
     def work_space(self, base: Base) -> SpatialSpace:
@@ -174,7 +158,7 @@ class SpatialBackend(Backend):
     def input_matrix(self, state: RodState) -> Array:
         """Return B(q)Λ (4N-1, M)."""
         columns = np.zeros((self.size, len(self.mesh.gain)))
-        spatial_elastic.input_columns(self._framed(state)[1].frame, self.rod, columns)
+        input_columns(self._framed(state)[1].frame, 4, self.rod, columns)
         return self.full(columns)
 
     def _framed(self, state: RodState) -> tuple[Array, SpatialSpace]:

@@ -62,20 +62,20 @@ class Linearisation:
     Attributes:
         intervals: K. steps: S, integrator steps in an interval.
         outputs: (P,) indices into q.
-        solved: the solves that it comes from.
+        chain: the solves that it comes from.
+        state_rows: (F,) unknowns of the kernels that are free.
     """
 
     intervals: int
     steps: int
     outputs: NDArray[np.int64]
-    solved: Solved
-    _chain: SolveChain
-    _state_rows: NDArray[np.int64]
+    chain: SolveChain
+    state_rows: NDArray[np.int64]
 
     @property
     def input_count(self) -> int:
         """M."""
-        return int(self._chain.record.inputs.shape[2])
+        return int(self.chain.record.inputs.shape[2])
 
     def tangent(
         self, pressures: ArrayLike, start: tuple[ArrayLike, ArrayLike] | None = None
@@ -92,14 +92,14 @@ class Linearisation:
             given = by_step(given, self.steps, self.input_count)[..., None]
         shape, columns = (self.intervals, self.steps, self.input_count), given.shape[3]
         change = array(given, (*shape, columns), "pressures")
-        initial = np.zeros((2, len(self._chain.mass), columns))
+        initial = np.zeros((2, len(self.chain.mass), columns))
         if start is not None:
-            rows = (len(self._state_rows),) if alone else (len(self._state_rows), columns)
+            rows = (len(self.state_rows),) if alone else (len(self.state_rows), columns)
             for row, value in enumerate(start):
                 found = array(value, rows, "start")
-                initial[row, self._state_rows] = found[:, None] if alone else found
+                initial[row, self.state_rows] = found[:, None] if alone else found
         out = np.empty((self.intervals + 1, len(self.outputs), columns))
-        step_kernel.tangent(change, initial, self._chain, out)
+        step_kernel.tangent(change, initial, self.chain, out)
         return out[..., 0] if alone else out
 
     def sensitivity(self, pulse: ArrayLike | None = None) -> Array:
@@ -116,7 +116,7 @@ class Linearisation:
             rows = np.shape(pulse)[0] if np.ndim(pulse) else 0
             shape = array(pulse, (rows, self.input_count), "pulse")
         out = np.zeros((self.intervals + 1, len(self.outputs), self.intervals, self.input_count))
-        step_kernel.sensitivity(shape, self.intervals, self.steps, 16, self._chain, out)
+        step_kernel.sensitivity(shape, self.intervals, self.steps, 16, self.chain, out)
         return out
 
 
@@ -149,15 +149,6 @@ class Trajectory:
     def tip(self) -> Array:
         """(K+1, 3) position of the last node [m]."""
         return self.q[:, -3:].copy()
-
-
-def linearisation_of(
-    backend: Backend, solved: Solved, shape: tuple[int, int], outputs: NDArray[np.int64],
-    rows: NDArray[np.int64]
-) -> Linearisation:  # fmt: skip
-    """Return the linearisation of solves in shape (K, S); rows are the outputs' in the kernels."""
-    chain = chain_of(backend, solved, rows)
-    return Linearisation(*shape, outputs, solved, chain, backend.free_rows)
 
 
 def chain_of(backend: Backend, solved: Solved, rows: NDArray[np.int64]) -> SolveChain:

@@ -15,10 +15,11 @@ from der_planner.rod.backend import RodState, positions_of
 from der_planner.rod.dimensions import PlanarBackend, SpatialBackend
 from der_planner.rod.integration import (
     Integrator,
+    Linearisation,
     Method,
     Trajectory,
+    chain_of,
     find_equilibrium,
-    linearisation_of,
     step_matrices,
 )
 from der_planner.rod.mesh import (
@@ -219,7 +220,6 @@ class Rod:
         method: Method = "sdirk2",
         *,
         forces: ArrayLike | None = None,
-        halvings: int = 0,
     ) -> RodState:
         """Advance by dt [s] under constant pressures u (M,) [Pa] and point forces (N, 3) [N].
 
@@ -231,16 +231,12 @@ class Rod:
                 "midpoint" (second order, one solve, keeps energy, unstable when a step turns an
                 edge far while stretching is undamped) or "backward_euler" (first order, robust).
             forces: on the nodes.
-            halvings: how often a step that does not converge may be cut in two.
 
         Raises:
             ConvergenceError: Newton's iteration failed.
         """
-        pressures = array(u, (self.segment_count,), "u")[None, None, :]
-        load = self._load(forces)
-        motion, _ = self._integrator.run(
-            state, pressures, positive(dt, "dt"), method, load, halvings=halvings
-        )
+        pressures = array(u, (self.segment_count,), "u")[None]
+        motion = self.simulate(state, pressures, dt, method=method, forces=forces, halvings=0)
         return motion.final
 
     def simulate(
@@ -285,10 +281,9 @@ class Rod:
         if solved is None:
             return motion
         wanted = self.output_indices(outputs)
-        linearisation = linearisation_of(
-            self._backend, solved, (len(inputs), substeps), wanted, self._backend.rows(wanted)
-        )
-        return replace(motion, linearisation=linearisation)
+        chain = chain_of(self._backend, solved, self._backend.rows(wanted))
+        linear = Linearisation(len(inputs), substeps, wanted, chain, self._backend.free_rows)
+        return replace(motion, linearisation=linear)
 
     def equilibrium(
         self, u: ArrayLike, *, start: RodState | None = None, forces: ArrayLike | None = None
@@ -342,13 +337,7 @@ class Rod:
         return float(np.linalg.eigvals(moving).real.min())
 
     def linearise_step(
-        self,
-        state: RodState,
-        u: ArrayLike,
-        dt: float,
-        method: Method = "sdirk2",
-        *,
-        forces: ArrayLike | None = None,
+        self, state: RodState, u: ArrayLike, dt: float, method: Method = "sdirk2"
     ) -> tuple[Array, Array]:
         """Return the exact A (2F, 2F), B (2F, M) of δx' = A δx + B δu for one step from `state`.
 
@@ -358,7 +347,7 @@ class Rod:
         """
         pressures = array(u, (self.segment_count,), "u")[None, None, :]
         _, solved = self._integrator.run(
-            state, pressures, positive(dt, "dt"), method, self._load(forces), linearise=True
+            state, pressures, positive(dt, "dt"), method, self.external_force, linearise=True
         )
         assert solved is not None  # since it was linearised
         return step_matrices(self._backend, solved)

@@ -16,13 +16,13 @@ J y = (M rate² + D rate) δq + M rate δv + `back` δq + `inputs` δu (see `Rec
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from der_planner.arrays import Array
-from der_planner.rod.banded_kernel import add_product, put, solve_columns
+from der_planner.rod.banded_kernel import add_product, factor_general, put, solve_columns
 from der_planner.rod.compile import allocating_kernel, inlined_kernel, kernel
 
 
@@ -113,6 +113,39 @@ def go_on(
         acceleration[d] = (velocity - v_n[d]) * rate
         x_n[d] += extrapolate * (x[d] - x_n[d])
         v_n[d] += extrapolate * (velocity - v_n[d])
+
+
+@kernel
+def input_columns(edge: Array, per_node: int, rod: Any, columns: Array) -> None:
+    """Fill columns (unknowns, M) with B(q)Λ of a rod with so many unknowns a node.
+
+    At a segment's first edge −Λ ẑ×t on its first node and +Λ ẑ×t on the second, at its last edge
+    the reverse: the two couples of the paper's Corollary 1. Each row of edge begins with t.
+    """
+    first, last, gain = rod.first, rod.last, rod.gain
+    columns[:] = 0.0
+    for m in range(gain.shape[0]):
+        for end in range(2):
+            j = first[m] if end == 0 else last[m]
+            force = -gain[m] if end == 0 else gain[m]
+            behind, ahead = per_node * j, per_node * (j + 1)
+            columns[behind, m] += force * edge[j, 1]
+            columns[behind + 1, m] -= force * edge[j, 0]
+            columns[ahead, m] -= force * edge[j, 1]
+            columns[ahead + 1, m] += force * edge[j, 0]
+
+
+@kernel
+def keep(slot: int, space: Any, record: Record) -> None:
+    """Write a solve's linearisation, of which `space` has J and the part by −x_n, into the record.
+
+    The columns of the inputs are there already.
+    """
+    factor_general(space.a)
+    for d in range(space.a.shape[0]):
+        put(space.a[d], record.factors[slot, d])
+        if record.back.shape[0] > 0:
+            put(space.drag[d], record.back[slot, d])
 
 
 class SolveChain(NamedTuple):

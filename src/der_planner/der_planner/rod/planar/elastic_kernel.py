@@ -312,22 +312,3 @@ def add_viscous(v: Array, rate: float, space: PlanarSpace, rod: PlanarRod) -> No
                 drag[base + row, 5 + column - row] += (
                     strength * rate * gradient[row] * gradient[column]
                 )
-
-
-@kernel
-def input_columns(edge: Array, rod: PlanarRod, columns: Array) -> None:
-    """Fill columns (2n, M) with B(q)Λ for the tangents in edge.
-
-    At a segment's first edge −Λ n̂ on its first node and +Λ n̂ on the second (n̂ = ẑ×t), at its last
-    edge the reverse: the two couples of the paper's Corollary 1.
-    """
-    first, last, gain = rod.first, rod.last, rod.gain
-    columns[:] = 0.0
-    for m in range(gain.shape[0]):
-        for end in range(2):
-            j = first[m] if end == 0 else last[m]
-            force = -gain[m] if end == 0 else gain[m]
-            columns[2 * j, m] += force * edge[j, 1]
-            columns[2 * j + 1, m] -= force * edge[j, 0]
-            columns[2 * j + 2, m] -= force * edge[j, 1]
-            columns[2 * j + 3, m] += force * edge[j, 0]

@@ -20,7 +20,6 @@ from der_planner.rod.planar.elastic_kernel import (
     PlanarRod,
     PlanarSpace,
     assemble,
-    input_columns,
     unsymmetric,
 )
 from der_planner.rod.step_kernel import (
@@ -29,6 +28,8 @@ from der_planner.rod.step_kernel import (
     Solver,
     add_inertia,
     go_on,
+    input_columns,
+    keep,
     predict,
 )
 
@@ -123,27 +124,13 @@ def simulate(
             total += iterations
             if record.factors.shape[0] > 0:
                 slot = (index - begin) * stages + stage
-                keep(slot, x, x_n, rate, u, record, space, rod)
+                linearise(x, x_n, rate, u, record.inputs[slot], space, rod)
+                keep(slot, space, record)
             go_on(x, x_n, v_n, acceleration, rate, solver.extrapolate[stage])
         if step == steps - 1:
             put(x_n, q[k + 1])
             put(v_n, v[k + 1])
     return intervals * steps, total, 0.0, 0
-
-
-@kernel
-def keep(
-    slot: int, x: Array, x_n: Array, rate: float, u: Array, record: Record,
-    space: PlanarSpace, rod: PlanarRod
-) -> None:  # fmt: skip
-    """Write the exact linearisation of the solve that led from x_n to x into the record."""
-    linearise(x, x_n, rate, u, record.inputs[slot], space, rod)
-    factor_general(space.a)
-    for d in range(x.shape[0]):
-        put(space.a[d], record.factors[slot, d])
-    if record.back.shape[0] > 0:
-        for d in range(x.shape[0]):
-            put(space.drag[d], record.back[slot, d])
 
 
 @kernel
@@ -165,7 +152,7 @@ def linearise(
     unsymmetric(v, rate, u, space, rod)
     hold_rows(space.a, fixed, 1.0)
     hold_rows(space.drag, fixed, 0.0)
-    input_columns(space.edge, rod, columns)
+    input_columns(space.edge, 2, rod, columns)
     for d in fixed:
         for m in range(columns.shape[1]):
             columns[d, m] = 0.0

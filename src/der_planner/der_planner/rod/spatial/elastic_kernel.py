@@ -299,22 +299,3 @@ def energy(x: Array, space: SpatialSpace, rod: SpatialRod) -> float:
         total += 0.5 * bend[i] * square + 0.25 * cubic[i] * square * square
         total += 0.5 * twist[i] * (strain[2] - rest_twist[i]) ** 2
     return total
-
-
-@kernel
-def input_columns(frame: Array, rod: SpatialRod, columns: Array) -> None:
-    """Fill columns (4n-1, M) with B(q)Λ.
-
-    At a segment's first edge −Λ ẑ×t on its first node and +Λ ẑ×t on the second, at its last edge
-    the reverse: the two couples of the paper's Corollary 1.
-    """
-    first, last, gain = rod.first, rod.last, rod.gain
-    columns[:] = 0.0
-    for m in range(gain.shape[0]):
-        for end in range(2):
-            j = first[m] if end == 0 else last[m]
-            force = -gain[m] if end == 0 else gain[m]
-            columns[4 * j, m] += force * frame[j, 1]
-            columns[4 * j + 1, m] -= force * frame[j, 0]
-            columns[4 * j + 4, m] -= force * frame[j, 1]
-            columns[4 * j + 5, m] += force * frame[j, 0]

@@ -32,7 +32,6 @@ from der_planner.rod.spatial.elastic_kernel import (
     T,
     add_curvature_hessian,
     frames,
-    input_columns,
     node_strains,
     reference_twists,
 )
@@ -43,6 +42,8 @@ from der_planner.rod.step_kernel import (
     Solver,
     add_inertia,
     go_on,
+    input_columns,
+    keep,
     predict,
 )
 
@@ -196,7 +197,8 @@ def simulate(
             extrapolate = solver.extrapolate[stage]
             if record.factors.shape[0] > 0:
                 slot = (index - begin) * stages + stage
-                keep(slot, x, x_n, rate, u, record, space, rod)
+                linearise(x, x_n, rate, u, record.inputs[slot], space, rod)
+                keep(slot, space, record)
                 gauge_of_step(x, x_n, extrapolate, record.gauge[slot], space)
             go_on(x, x_n, v_n, acceleration, rate, extrapolate)
             carry(x_n, space)
@@ -204,19 +206,6 @@ def simulate(
             put(x_n, q[k + 1])
             put(v_n, v[k + 1])
     return intervals * steps, total, 0.0, 0
-
-
-@kernel
-def keep(
-    slot: int, x: Array, x_n: Array, rate: float, u: Array, record: Record,
-    space: SpatialSpace, rod: SpatialRod
-) -> None:  # fmt: skip
-    """Write the exact linearisation of the solve that led from x_n to x into the record."""
-    linearise(x, x_n, rate, u, record.inputs[slot], space, rod)
-    factor_general(space.a)
-    for d in range(x.shape[0]):
-        put(space.a[d], record.factors[slot, d])
-        put(space.drag[d], record.back[slot, d])
 
 
 @kernel
@@ -288,7 +277,7 @@ def linearise(
         a[d, 10] += rate * (body.mass[d] * rate + body.damping[d])
     hold_rows(a, body.fixed, 1.0)
     hold_rows(drag, body.fixed, 1.0)
-    input_columns(frame, rod, columns)
+    input_columns(frame, 4, rod, columns)
     for d in body.fixed:
         for m in range(columns.shape[1]):
             columns[d, m] = 0.0
