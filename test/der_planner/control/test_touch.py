@@ -14,6 +14,8 @@ from der_planner.model.compliance import compliance
 
 LIMB = replace(Limb.default(), connector_length=0.0, base_length=0.0)
 DEVIATION = np.array([40.0, 40.0, 2e-4, 2e-4])
+STILL = Lacking(0.0, *np.zeros((3, 2)), np.zeros(4), np.zeros((4, 4)), np.zeros((2, 2)))
+"""A limb that lacks nothing and does not rub."""
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +26,7 @@ def model():
 def calibrated() -> FreeLevel:
     """Return the free level of a limb that is well known."""
     free = FreeLevel(LIMB)
-    still = Lacking(0.0, *np.zeros((3, 2)), np.zeros(4), 1e-12 * np.eye(4))
+    still = replace(STILL, covariance=1e-12 * np.eye(4))
     for k in range(4000):
         away = DEVIATION * (-1) ** k
         felt = replace(still, effective=np.array([k % 7, k % 5]) * 1e3, value=away)
@@ -44,13 +46,13 @@ def lacking(model, forces, pressure=(6000.0, 3000.0)) -> Lacking:
     missing = np.linalg.solve(compliance(model, bend, [0.1]).bend_by_pressure, bend - before)
     even = model.kinematics
     offset = (pushed.q - free.q)[-3:-1] - (even.tip(bend) - even.tip(before))
-    return Lacking(
-        1.0,
-        bend,
-        pressures,
-        np.zeros(2),
-        np.concatenate([missing, offset]),
-        np.diag((DEVIATION / 4) ** 2),
+    return replace(
+        STILL,
+        time=1.0,
+        bend_angles=bend,
+        effective=pressures,
+        value=np.concatenate([missing, offset]),
+        covariance=np.diag((DEVIATION / 4) ** 2),
     )
 
 
@@ -169,7 +171,7 @@ def test_friction_that_is_larger_and_less_even_than_said_is_no_touch():
         for s in LIMB.segments
     ]
     sense = TouchSense(RodModel(replace(LIMB, segments=tuple(segments))))
-    still = Lacking(0.0, *np.zeros((3, 2)), np.zeros(4), np.diag((DEVIATION / 4) ** 2))
+    still = replace(STILL, covariance=np.diag((DEVIATION / 4) ** 2))
     for k in range(900):
         turned = np.clip(3.0 * np.sin(0.03 * k + np.array([0.0, 1.0])), -1.0, 1.0)
         value = np.concatenate([-450.0 * turned, [1.2e-3 * turned[0], 8e-4 * turned[1]]])
@@ -178,11 +180,33 @@ def test_friction_that_is_larger_and_less_even_than_said_is_no_touch():
     assert sense.look(replace(still, time=30.0, value=np.array([900.0, 0.0, 0.0, 0.0]))).touched
 
 
+def test_friction_of_what_has_slid_holds_less_or_as_much_but_no_harder(model):
+    """Both segments have slid to the left, stand still, and may be held by 1 kPa either way."""
+    stuck = np.array([[0.0, 0.0], [2000.0, 2000.0]])
+    here = replace(STILL, covariance=np.diag((DEVIATION / 4) ** 2), stuck=stuck)
+    lets_go, held = (
+        TouchSense(model, calibrated()).look(replace(here, value=value * np.array([1, 1, 0, 0])))
+        for value in (1800.0, -900.0)
+    )
+    assert not lets_go.touched
+    assert held.touched
+
+
+def test_what_friction_may_hide_of_a_touch_does_not_end_it(model):
+    sense, hit = TouchSense(model, calibrated()), lacking(model, {20: (0.0, 0.2)})
+    assert sense.look(hit).touched
+    hidden = np.stack([np.minimum(hit.value[:2], 0.0), np.maximum(hit.value[:2], 0.0)])
+    offset = np.append(hit.value[:2], [0.0, 0.0])
+    now = replace(hit, time=1.1, value=offset, stuck=2.0 * hidden)
+    assert sense.look(now).touched
+    assert not TouchSense(model, calibrated()).look(now).touched
+
+
 @pytest.mark.slow
 def test_noise_is_taken_for_a_touch_about_once_in_an_hour(model):
     draw = np.random.default_rng(8)
     sense, spread = TouchSense(model), np.array([700.0, 300.0, 2e-3, 1e-3])
-    still = Lacking(0.0, *np.zeros((3, 2)), np.zeros(4), 1e-6 * np.diag(spread**2))
+    still = replace(STILL, covariance=1e-6 * np.diag(spread**2))
     for k in range(400):
         value = 0.5 * spread * draw.standard_normal(4)
         sense.look(replace(still, time=0.3 * k, value=value))

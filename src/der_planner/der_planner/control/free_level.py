@@ -3,14 +3,17 @@
 Gains, friction and the camera are a little wrong. What is lacking (`Lacking.value`) is then
 c + γ·w + κ·θ + φ·z + e and some noise, with the pressures w of all segments, their bend angles θ
 where gravity bends the limb as well, the share z of its friction that a segment has taken up, and
-an e that wanders and is forgotten. It is less known where friction turns round or the limb hardly
-moves: what sticks takes any pressure up to its friction. c, γ, κ, φ, e and noise are learned while
-nothing is touched.
+an e that wanders and is forgotten. c, γ, κ, φ, e and noise are learned while nothing is touched.
+
+A segment that sticks is held by anything between its largest friction one way and the other. Its
+model says F z: what is lacking may be anything between F (z − 1) and F (z + 1) then, and nothing
+beyond. A segment that has slid one way, and is stopped, may thus be held less than before, but no
+harder: what holds it harder is a touch.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,11 +26,11 @@ _FREE_LEVEL = 250.0, 2e-3
 """Standard deviations of c, of a limb that nothing is known of yet [Pa], and of the tip [m]."""
 _FREE_NOISE = 110.0, 2e-4
 """The same of e and noise together."""
-_FREE_GAIN, _FREE_COUPLING, _FREE_TIP = 0.15, 0.05, 1e-7
+_FREE_GAIN, _FREE_COUPLING, _FREE_TIP = 0.1, 0.03, 1e-7
 """The same of γ by a segment's own pressure and by that of another, and of the tip [m/Pa]."""
 _FREE_STIFFNESS, _FREE_TIP_BENT = 0.25, 1e-3
 """The same of κ, over the segment's stiffness, and of the tip [m/rad]."""
-_FREE_FRICTION = 0.5
+_FREE_FRICTION = 0.25
 """The same of φ, over the largest friction that the model knows."""
 _RUBS_UNEVENLY = 0.2
 """How far friction that is uneven along a segment moves the tip, over how far it bends the segment
@@ -44,10 +47,14 @@ _SAYS_NEW = 0.5
 """Time after which noise says something new of c, γ, κ and e [s]."""
 _FRICTION_WRONG = 0.75
 """Standard deviation of friction from its model where it turns round, over its largest."""
-_FRICTION_SLIDING = 0.02
-"""Variance elsewhere, over that."""
+_FRICTION_SLIDING = 0.0025
+"""Its variance elsewhere, over the square of its largest."""
 _STICKS = 0.01
 """Rate of a bend angle below which its segment may stick [rad/s]."""
+_LEAST_TURN = 1e-3
+"""Way of a bend angle in which friction turns round, at least [rad]."""
+_SLIDES_AFTER = 0.1
+"""Way of a bend angle after which friction holds it as it should, once it has turned [rad]."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +68,8 @@ class Lacking:
         friction: (M,) z, −1 … 1.
         value: (M + 2,) pressure that the model lacks [Pa], and the tip's displacement that the
             bend angles do not explain [m].
-        covariance: of value, with what friction may differ from its model.
+        covariance: of value, where friction is what its model says.
+        stuck: (2, M) least and most of value that friction explains of segments that stick [Pa].
     """
 
     time: float
@@ -70,15 +78,17 @@ class Lacking:
     friction: Array
     value: Array
     covariance: Array
+    stuck: Array
 
     @staticmethod
-    def of(time: float, nominal: Nominal, known: Knowledge) -> Lacking:
+    def of(time: float, nominal: Nominal, known: Knowledge, slid: Array) -> Lacking:
         """Return what the estimator says that the model lacks.
 
         Args:
             time: [s].
             nominal: the model's motion.
             known: the filter's state then.
+            slid: (M,) way that bends have gone since they turned round [rad].
         """
         bend, rate, _ = nominal.at(time)
         inputs, rate = len(bend), rate + known.parts[1]
@@ -87,13 +97,38 @@ class Lacking:
         rows[:inputs, 3 * inputs : 4 * inputs] = np.diag(known.effective)
         rows[inputs:, 4 * inputs :] = np.eye(2)
         spread = rows @ known.covariance @ rows.T
-        turning = _FRICTION_SLIDING + 1.0 - known.memory.friction**2
-        turning = np.minimum(1.0, turning + 1.0 / (1.0 + (rate / _STICKS) ** 2))
-        pressure, uneven = _friction(nominal.model.limb)
-        spread[:inputs, :inputs] += np.diag((_FRICTION_WRONG * pressure) ** 2 * turning)
-        spread[inputs:, inputs:] += (uneven**2 @ turning) * np.eye(2)
         bent, turned = bend + known.parts[0], known.memory.friction
-        return Lacking(time, bent, known.effective, turned, rows @ known.mean, spread)
+        still = _STICKS**2 + np.diag(known.covariance)[inputs : 2 * inputs]
+        # A bend that goes the other way than its friction says has turned, and friction with it.
+        goes_on = np.maximum(slid * np.sign(turned), 0.0)
+        sticks = np.maximum(still / (still + rate**2), np.exp(-goes_on / _SLIDES_AFTER))
+        # It is told from the slow part of the bend: of swings it knows nothing.
+        segments = nominal.model.limb.segments
+        turning = np.array([s.friction_curvature * s.length for s in segments])
+        swung = np.abs(known.parts[0] - known.slow) / np.maximum(turning, _LEAST_TURN)
+        sticks = np.minimum(1.0, sticks + swung + 1.0 - turned**2)
+        pressure, uneven = _friction(nominal.model.limb)
+        spread[:inputs, :inputs] += _FRICTION_SLIDING * np.diag(pressure**2)
+        spread[inputs:, inputs:] += (uneven**2 @ sticks) * np.eye(2)
+        stuck = pressure * sticks * np.stack([turned - 1.0, turned + 1.0])
+        value = rows @ known.mean
+        return Lacking(time, bent, known.effective, turned, value, spread, stuck)
+
+    @property
+    def doubtful(self) -> Array:
+        """(M + 2, M + 2) covariance with that of friction where segments stick."""
+        half = np.append(np.ptp(self.stuck, axis=0) / 2, np.zeros(2))
+        return self.covariance + np.diag((_FRICTION_WRONG * half) ** 2)
+
+    @property
+    def beside_friction(self) -> Array:
+        """(M + 2,) the least of value that friction does not explain where segments stick.
+
+        A segment that has slid one way may be held less there, but no harder.
+        """
+        left, segments = self.value.copy(), self.stuck.shape[1]
+        left[:segments] -= np.clip(left[:segments], *self.stuck)
+        return left
 
     def by(self, kept: float) -> Array:
         """Return what c, γ, κ, φ and e are multiplied by, with the share of e that is left."""
@@ -155,7 +190,7 @@ class FreeLevel:
         Args:
             lacking: then.
             duration: for which it held [s].
-            away: (M + 2,) from what was expected before.
+            away: (M + 2,) from what was expected before, beside what friction explains.
             variance: (M + 2,) that was expected, see `expected`.
         """
         kept = np.exp(-duration / _FORGOTTEN)
@@ -164,15 +199,16 @@ class FreeLevel:
         self._covariance[:, :, -1] *= kept
         self._covariance[:, -1, -1] += _WANDERS * (1.0 - kept**2) * self.noise
         by = lacking.by(1.0)
-        other = np.diag(lacking.covariance)
+        other = np.diag(lacking.doubtful)
         seen = self._covariance @ by
         white = (1.0 - _WANDERS) * self.noise
         old = _SAYS_NEW / duration * (white + other)
         gain = seen / (seen @ by + old)[:, None]
-        self._mean += gain * (lacking.value - self._mean @ by)[:, None]
+        left = replace(lacking, value=lacking.value - self._mean @ by).beside_friction
+        self._mean += gain * left[:, None]
         self._covariance -= gain[:, :, None] * seen[:, None, :]
         # How much of what was away is noise and e, by what was expected of each.
-        total = variance + other
+        total = variance + np.diag(lacking.covariance)
         part = np.minimum(1.0, self.noise / total)
         found = self.noise * (1.0 + part * (away**2 / total - 1.0))
         self.noise = self.noise + duration / (self._worth + duration) * (found - self.noise)

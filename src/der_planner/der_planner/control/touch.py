@@ -140,6 +140,7 @@ class TouchSense:
         self._places = np.linspace(limb.base_length, limb.length, _PLACES + 1)[1:]
         self.threshold = _chance(_CORRELATED / _HOUR, model.inputs + 2)
         self.newest = untouched(-np.inf, np.zeros(model.inputs))
+        self._slid = np.zeros(model.inputs)
         self._recent: deque[tuple[Lacking, float, Array, Array]] = deque()
         self._weighed: list[tuple[float, float, bool]] = []
         self._learned = self._calm = -np.inf
@@ -153,20 +154,25 @@ class TouchSense:
             nominal: the model's motion.
             known: the filter's state then.
         """
-        return self.look(Lacking.of(time, nominal, known))
+        passed = min(time - self.newest.time, _LONGEST)
+        rate = nominal.at(time)[1] + known.parts[1]
+        self._slid = np.where(rate * self._slid > 0.0, self._slid, 0.0) + passed * rate
+        return self.look(Lacking.of(time, nominal, known, self._slid))
 
     def look(self, lacking: Lacking) -> Touch:
         """Return what a newer instant says of a touch."""
         before = self.newest
-        away, variance, distance = self._away(lacking, self.free, self._learned)
+        away, variance = self._away(lacking, self.free, self._learned)
+        distance = self._distance(away, away.covariance)
         touched = distance > (_RELEASED if before.touched else 1.0)
-        if touched and not before.touched:
-            touched = not self._lets_go(lacking, away.covariance)
-            away, variance, distance = self._away(lacking, self.free, self._learned)
+        if touched and not before.touched and self._lets_go(lacking, away.covariance):
+            away, variance = self._away(lacking, self.free, self._learned)
+            distance, touched = self._distance(away, away.covariance), False
         if distance < _RELEASED:
             self._calm = lacking.time
         if 0.0 < lacking.time - before.time < _LONGEST:
-            self._recent.append((lacking, lacking.time - before.time, away.value, variance))
+            passed = lacking.time - before.time
+            self._recent.append((lacking, passed, away.beside_friction, variance))
         if lacking.time - self._calm > _LEARNED_AFTER:
             self._recent.clear()
         since = before.since if before.touched else lacking.time
@@ -188,10 +194,8 @@ class TouchSense:
             self.free.learn(*self._recent.popleft())
         return self.newest
 
-    def _away(
-        self, lacking: Lacking, free: FreeLevel, learned: float
-    ) -> tuple[Lacking, Array, float]:
-        """Return what is away from a free level, that level's variance (M + 2,), and the distance.
+    def _away(self, lacking: Lacking, free: FreeLevel, learned: float) -> tuple[Lacking, Array]:
+        """Return what is away from a free level, with its covariance, and the level's variance.
 
         Args:
             lacking: of the model.
@@ -205,9 +209,16 @@ class TouchSense:
         value = lacking.value - mean
         if free.payload:
             value -= free.payload * self._weight_effect(lacking.bend_angles)
-        noise = lacking.covariance + np.diag(variance)
-        distance = float(value @ np.linalg.solve(noise, value)) / self.threshold
-        return replace(lacking, value=value, covariance=noise), variance, distance
+        covariance = lacking.covariance + np.diag(variance)
+        return replace(lacking, value=value, covariance=covariance), variance
+
+    def _distance(self, away: Lacking, noise: Array) -> float:
+        """Return the squared distance from the free level, over that of a touch.
+
+        What friction may hide of a touch that goes on does not end it.
+        """
+        left = away.value if self.newest.touched else away.beside_friction
+        return float(left @ np.linalg.solve(noise, left)) / self.threshold
 
     def _lets_go(self, lacking: Lacking, noise: Array) -> bool:
         """Return whether what seems to begin is the end of a touch, and go back to its free level.
@@ -220,8 +231,8 @@ class TouchSense:
             noise: (M + 2, M + 2) covariance of what is away from the newest free level.
         """
         for place, earlier in enumerate(self._earlier):
-            value = self._away(lacking, *earlier)[0].value
-            if value @ np.linalg.solve(noise, value) < _RELEASED * self.threshold:
+            away, _ = self._away(lacking, *earlier)
+            if self._distance(away, noise) < _RELEASED:
                 self.free, self._learned = copy.deepcopy(earlier)
                 del self._earlier[place + 1 :]
                 self._recent.clear()
@@ -250,7 +261,7 @@ class TouchSense:
         if age == 0.0:
             self._weighed.clear()
         weight = self._weight_effect(away.bend_angles)
-        inverse = np.linalg.inv(away.covariance + np.diag((_EFFECT_WRONG * away.value) ** 2))
+        inverse = np.linalg.inv(away.doubtful + np.diag((_EFFECT_WRONG * away.value) ** 2))
         pull = float(weight @ inverse @ weight)
         mass = float(weight @ inverse @ away.value) / pull
         left = float(away.value @ inverse @ away.value) - mass**2 * pull
@@ -283,7 +294,7 @@ def locate(model: RodModel, lacking: Lacking, places: Array) -> Touch:
     moved = model.kinematics.tip_jacobians(lacking.bend_angles) @ bent @ lacking.value[:-2]
     doubt = _EFFECT_WRONG * lacking.value
     doubt[-2:] = _UNEVEN * np.linalg.norm(moved)
-    weight = np.linalg.inv(lacking.covariance + np.diag(doubt**2))
+    weight = np.linalg.inv(lacking.doubtful + np.diag(doubt**2))
     seen = np.swapaxes(effect, 1, 2) @ weight
     square, pull = seen @ effect, seen @ lacking.value
     across = pull[:, 1] / (square[:, 1, 1] + 1.0 / _LARGEST_FORCE**2)
