@@ -6,9 +6,7 @@ Beside the graphs of all runs, an experiment may have a page.
 from __future__ import annotations
 
 import contextlib
-import itertools
 import os
-import signal
 import tempfile
 import threading
 import time
@@ -288,13 +286,8 @@ class RunningGraph:
             )
 
     def stop(self) -> dict[str, int]:
-        """Stop every node; return the exit codes by name.
-
-        Those before the driver end beside each other; it vents, and its board is there until then.
-        """
+        """Stop every node; return the exit codes by name."""
         order = [name for name in STOP_ORDER if name in self.processes]
-        for name in itertools.takewhile(lambda name: name != "pressure_driver", order):
-            self.processes[name].signal(signal.SIGTERM)
         return {name: self.processes[name].stop() for name in order}
 
 
