@@ -88,7 +88,7 @@ class Lacking:
             time: [s].
             nominal: the model's motion.
             known: the filter's state then.
-            slid: (M,) way that bends have gone since they turned round [rad].
+            slid: (M,) way that bends have gone since they turned round, with its sign [rad].
         """
         bend, rate, _ = nominal.at(time)
         inputs, rate = len(bend), rate + known.parts[1]

@@ -170,8 +170,8 @@ class TouchSense:
             distance, touched = self._distance(away, away.covariance), False
         if distance < _RELEASED:
             self._calm = lacking.time
-        if 0.0 < lacking.time - before.time < _LONGEST:
-            passed = lacking.time - before.time
+        passed = lacking.time - before.time
+        if 0.0 < passed < _LONGEST:
             self._recent.append((lacking, passed, away.beside_friction, variance))
         if lacking.time - self._calm > _LEARNED_AFTER:
             self._recent.clear()
