@@ -68,8 +68,10 @@ def test_a_silent_driver_is_said_first_with_what_the_limb_did(
 
 
 def test_a_driver_that_ended_says_why_and_how_it_was_started(situation: Situation) -> None:
-    line = [sys.executable, "-c", "input()", "port:=/dev/mine"]
-    process = subprocess.Popen(line, stdin=subprocess.PIPE)
+    line = [sys.executable, "-c", "print(flush=True); input()", "port:=/dev/mine"]
+    process = subprocess.Popen(line, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    assert process.stdout is not None
+    process.stdout.readline()  # before it runs, the system may know no command line of it
     here = f"{socket.gethostname()}:{process.pid}"
     situation.put_status(driver_at(here))
     situation.put_driver(state(PressureState.ARMED))
