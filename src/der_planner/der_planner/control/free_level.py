@@ -30,7 +30,7 @@ _FREE_GAIN, _FREE_COUPLING, _FREE_TIP = 0.1, 0.03, 1e-7
 """The same of γ by a segment's own pressure and by that of another, and of the tip [m/Pa]."""
 _FREE_STIFFNESS, _FREE_TIP_BENT = 0.25, 1e-3
 """The same of κ, over the segment's stiffness, and of the tip [m/rad]."""
-_FREE_FRICTION = 0.25
+_FREE_FRICTION = 0.15
 """The same of φ, over the largest friction that the model knows."""
 _RUBS_UNEVENLY = 0.2
 """How far friction that is uneven along a segment moves the tip, over how far it bends the segment
@@ -51,8 +51,6 @@ _FRICTION_SLIDING = 0.0025
 """Its variance elsewhere, over the square of its largest."""
 _STICKS = 0.01
 """Rate of a bend angle below which its segment may stick [rad/s]."""
-_LEAST_TURN = 1e-3
-"""Way of a bend angle in which friction turns round, at least [rad]."""
 _SLIDES_AFTER = 0.1
 """Way of a bend angle after which friction holds it as it should, once it has turned [rad]."""
 
@@ -81,32 +79,29 @@ class Lacking:
     stuck: Array
 
     @staticmethod
-    def of(time: float, nominal: Nominal, known: Knowledge, slid: Array) -> Lacking:
+    def of(time: float, nominal: Nominal, known: Knowledge, rate: Array, slid: Array) -> Lacking:
         """Return what the estimator says that the model lacks.
 
         Args:
             time: [s].
             nominal: the model's motion.
             known: the filter's state then.
+            rate: (M,) of bends, without what swings [rad/s].
             slid: (M,) way that bends have gone since they turned round, with its sign [rad].
         """
-        bend, rate, _ = nominal.at(time)
-        inputs, rate = len(bend), rate + known.parts[1]
+        bend = nominal.at(time)[0]
+        inputs = len(bend)
         rows = np.zeros((inputs + 2, len(known.mean)))
         rows[:inputs, 2 * inputs : 3 * inputs] = np.eye(inputs)
         rows[:inputs, 3 * inputs : 4 * inputs] = np.diag(known.effective)
         rows[inputs:, 4 * inputs :] = np.eye(2)
         spread = rows @ known.covariance @ rows.T
         bent, turned = bend + known.parts[0], known.memory.friction
-        still = _STICKS**2 + np.diag(known.covariance)[inputs : 2 * inputs]
+        still = _STICKS**2
         # A bend that goes the other way than its friction says has turned, and friction with it.
         goes_on = np.maximum(slid * np.sign(turned), 0.0)
         sticks = np.maximum(still / (still + rate**2), np.exp(-goes_on / _SLIDES_AFTER))
-        # It is told from the slow part of the bend: of swings it knows nothing.
-        segments = nominal.model.limb.segments
-        turning = np.array([s.friction_curvature * s.length for s in segments])
-        swung = np.abs(known.parts[0] - known.slow) / np.maximum(turning, _LEAST_TURN)
-        sticks = np.minimum(1.0, sticks + swung + 1.0 - turned**2)
+        sticks = np.minimum(1.0, sticks + 1.0 - turned**2)
         pressure, uneven = _friction(nominal.model.limb)
         spread[:inputs, :inputs] += _FRICTION_SLIDING * np.diag(pressure**2)
         spread[inputs:, inputs:] += (uneven**2 @ sticks) * np.eye(2)

@@ -40,6 +40,10 @@ from der_planner.model.compliance import compliance
 _HOUR = 3600.0
 _CORRELATED = 0.3
 """Time after which what the model lacks says something new [s]."""
+_SWINGS = 0.1
+"""Time in which swings are left out of the bends' rates [s]."""
+_FOLLOWS = 0.3
+"""Time in which the estimator follows friction that turned round [s]."""
 _RELEASED = 0.5
 """Share of the threshold below which a touch ends."""
 _LEARNED_AFTER = 0.4
@@ -140,7 +144,8 @@ class TouchSense:
         self._places = np.linspace(limb.base_length, limb.length, _PLACES + 1)[1:]
         self.threshold = _chance(_CORRELATED / _HOUR, model.inputs + 2)
         self.newest = untouched(-np.inf, np.zeros(model.inputs))
-        self._slid = np.zeros(model.inputs)
+        self._rate, self._slid = np.zeros((2, model.inputs))
+        self._stuck, self._variance = np.zeros((2, model.inputs)), np.zeros(model.inputs + 2)
         self._recent: deque[tuple[Lacking, float, Array, Array]] = deque()
         self._weighed: list[tuple[float, float, bool]] = []
         self._learned = self._calm = -np.inf
@@ -156,8 +161,20 @@ class TouchSense:
         """
         passed = min(time - self.newest.time, _LONGEST)
         rate = nominal.at(time)[1] + known.parts[1]
-        self._slid = np.where(rate * self._slid > 0.0, self._slid, 0.0) + passed * rate
-        return self.look(Lacking.of(time, nominal, known, self._slid))
+        self._rate += (1.0 - np.exp(-passed / _SWINGS)) * (rate - self._rate)
+        goes_on = self._rate * self._slid > 0.0
+        self._slid = np.where(goes_on, self._slid, 0.0) + passed * rate
+        lacking = Lacking.of(time, nominal, known, self._rate, self._slid)
+        # The estimator follows what it did not expect, as friction that turned round, with a delay.
+        kept = np.exp(-passed / _FOLLOWS)
+        least, most = lacking.stuck
+        self._stuck = np.stack(
+            [np.minimum(least, kept * self._stuck[0]), np.maximum(most, kept * self._stuck[1])]
+        )
+        variance = np.diag(lacking.covariance)
+        self._variance = np.maximum(variance, kept**2 * self._variance)
+        spread = lacking.covariance + np.diag(self._variance - variance)
+        return self.look(replace(lacking, stuck=self._stuck, covariance=spread))
 
     def look(self, lacking: Lacking) -> Touch:
         """Return what a newer instant says of a touch."""
