@@ -28,7 +28,7 @@ from der_planner.model import CONTROL_PERIOD, RodModel
 
 Kind = Literal["warn", "hold", "yield", "vent"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
-_SUSPECTED = 0.3
+_SUSPECTED = 0.6
 """`Touch.distance` from which on corrections stay what they were."""
 _RETURN = 1.0, 4.0
 """Time in which corrections come back once a touch is no longer suspected, and once one has ended:
