@@ -1,16 +1,19 @@
 """Forces on the rod are found from what its bend and tip lack, and commands do not raise them."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from der_planner.control.free_level import FreeLevel, Lacking
+from der_planner.control.knowledge import Knowledge
 from der_planner.control.reaction import Reaction
 from der_planner.control.touch import TouchSense, untouched
 from der_planner.limb import Limb
 from der_planner.model import RodModel
 from der_planner.model.compliance import compliance
+from der_planner.model.material import Memory
 
 LIMB = replace(Limb.default(), connector_length=0.0, base_length=0.0)
 DEVIATION = np.array([40.0, 40.0, 2e-4, 2e-4])
@@ -165,12 +168,17 @@ def test_a_payload_is_weighed_and_contact_that_grows_is_not():
     assert grown[-1].payload == 0.0
 
 
-def test_friction_that_is_larger_and_less_even_than_said_is_no_touch():
+def rubbing() -> RodModel:
+    """Return a limb whose friction is worth 900 Pa."""
     segments = [
         replace(s, friction_moment=900.0 * s.moment_gain, friction_curvature=0.8)
         for s in LIMB.segments
     ]
-    sense = TouchSense(RodModel(replace(LIMB, segments=tuple(segments))))
+    return RodModel(replace(LIMB, segments=tuple(segments)))
+
+
+def test_friction_that_is_larger_and_less_even_than_said_is_no_touch():
+    sense = TouchSense(rubbing())
     still = replace(STILL, covariance=np.diag((DEVIATION / 4) ** 2))
     for k in range(900):
         turned = np.clip(3.0 * np.sin(0.03 * k + np.array([0.0, 1.0])), -1.0, 1.0)
@@ -200,6 +208,43 @@ def test_what_friction_may_hide_of_a_touch_does_not_end_it(model):
     now = replace(hit, time=1.1, value=offset, stuck=2.0 * hidden)
     assert sense.look(now).touched
     assert not TouchSense(model, calibrated()).look(now).touched
+
+
+def sliding(sense, model, time, missing, doubt=40.0):
+    """Feel a limb that bends by 0.1 rad/s, with rates that are hardly known, and lacks pressure.
+
+    Args:
+        time: [s].
+        missing: effective pressure of the first segment [Pa].
+        doubt: its standard deviation [Pa].
+    """
+    bend, none = np.full(2, 0.1 * time), np.zeros(2)
+    swings = 0.08 * np.cos(40.0 * time)
+    nominal = SimpleNamespace(at=lambda _: (bend, np.full(2, 0.1), np.zeros(2)), model=model)
+    mean = np.array([0.0, 0.0, swings, swings, missing, 0.0, 0.0, 0.0, 0.0, 0.0])
+    deviation = np.repeat([2e-3, 0.08, doubt, 1e-3, 1e-4], 2)
+    memory = Memory(bend, np.ones(2), none)
+    known = Knowledge(mean, np.diag(deviation**2), none, memory, none, 15_000.0 * bend)
+    return sense.feel(time, nominal, known)
+
+
+def test_a_limb_that_slides_with_another_gain_feels_what_stops_it():
+    model = rubbing()
+    sense = TouchSense(model)
+    for k in range(180):
+        assert not sliding(sense, model, k / 30, -80.0 * k / 30).touched
+    pushed = [sliding(sense, model, k / 30, -80.0 * k / 30 - 900.0) for k in range(180, 186)]
+    assert pushed[-1].touched
+
+
+def test_what_the_estimator_says_in_surprise_is_no_touch():
+    model = rubbing()
+    sense = TouchSense(model)
+    for k in range(180):
+        sliding(sense, model, k / 30, 0.0)
+    sliding(sense, model, 6.0, 0.0, doubt=1000.0)
+    assert not sliding(sense, model, 6.0 + 1 / 30, 1200.0).touched
+    assert sliding(sense, model, 7.0, 1200.0).touched
 
 
 @pytest.mark.slow
