@@ -19,6 +19,8 @@ LIMB = replace(Limb.default(), connector_length=0.0, base_length=0.0)
 DEVIATION = np.array([40.0, 40.0, 2e-4, 2e-4])
 STILL = Lacking(0.0, *np.zeros((3, 2)), np.zeros(4), np.zeros((4, 4)), np.zeros((2, 2)))
 """A limb that lacks nothing and does not rub."""
+KNOWN = replace(STILL, covariance=np.diag((DEVIATION / 4) ** 2))
+"""The same, as well as the estimator knows it."""
 
 
 @pytest.fixture(scope="module")
@@ -49,14 +51,8 @@ def lacking(model, forces, pressure=(6000.0, 3000.0)) -> Lacking:
     missing = np.linalg.solve(compliance(model, bend, [0.1]).bend_by_pressure, bend - before)
     even = model.kinematics
     offset = (pushed.q - free.q)[-3:-1] - (even.tip(bend) - even.tip(before))
-    return replace(
-        STILL,
-        time=1.0,
-        bend_angles=bend,
-        effective=pressures,
-        value=np.concatenate([missing, offset]),
-        covariance=np.diag((DEVIATION / 4) ** 2),
-    )
+    value = np.concatenate([missing, offset])
+    return replace(KNOWN, time=1.0, bend_angles=bend, effective=pressures, value=value)
 
 
 def frame(model, node, bend) -> np.ndarray:
@@ -179,19 +175,18 @@ def rubbing() -> RodModel:
 
 def test_friction_that_is_larger_and_less_even_than_said_is_no_touch():
     sense = TouchSense(rubbing())
-    still = replace(STILL, covariance=np.diag((DEVIATION / 4) ** 2))
     for k in range(900):
         turned = np.clip(3.0 * np.sin(0.03 * k + np.array([0.0, 1.0])), -1.0, 1.0)
         value = np.concatenate([-450.0 * turned, [1.2e-3 * turned[0], 8e-4 * turned[1]]])
-        found = sense.look(replace(still, time=k / 30, friction=turned, value=value))
+        found = sense.look(replace(KNOWN, time=k / 30, friction=turned, value=value))
         assert not found.touched
-    assert sense.look(replace(still, time=30.0, value=np.array([900.0, 0.0, 0.0, 0.0]))).touched
+    assert sense.look(replace(KNOWN, time=30.0, value=np.array([900.0, 0.0, 0.0, 0.0]))).touched
 
 
 def test_friction_of_what_has_slid_holds_less_or_as_much_but_no_harder(model):
     """Both segments have slid to the left, stand still, and may be held by 1 kPa either way."""
     stuck = np.array([[0.0, 0.0], [2000.0, 2000.0]])
-    here = replace(STILL, covariance=np.diag((DEVIATION / 4) ** 2), stuck=stuck)
+    here = replace(KNOWN, stuck=stuck)
     lets_go, held = (
         TouchSense(model, calibrated()).look(replace(here, value=value * np.array([1, 1, 0, 0])))
         for value in (1800.0, -900.0)
@@ -210,7 +205,7 @@ def test_what_friction_may_hide_of_a_touch_does_not_end_it(model):
     assert not TouchSense(model, calibrated()).look(now).touched
 
 
-def sliding(sense, model, time, missing, doubt=40.0):
+def sliding(sense, time, missing, doubt=40.0):
     """Feel a limb that bends by 0.1 rad/s, with rates that are hardly known, and lacks pressure.
 
     Args:
@@ -220,7 +215,7 @@ def sliding(sense, model, time, missing, doubt=40.0):
     """
     bend, none = np.full(2, 0.1 * time), np.zeros(2)
     swings = 0.08 * np.cos(40.0 * time)
-    nominal = SimpleNamespace(at=lambda _: (bend, np.full(2, 0.1), np.zeros(2)), model=model)
+    nominal = SimpleNamespace(at=lambda _: (bend, np.full(2, 0.1), none))
     mean = np.array([0.0, 0.0, swings, swings, missing, 0.0, 0.0, 0.0, 0.0, 0.0])
     deviation = np.repeat([2e-3, 0.08, doubt, 1e-3, 1e-4], 2)
     memory = Memory(bend, np.ones(2), none)
@@ -229,22 +224,20 @@ def sliding(sense, model, time, missing, doubt=40.0):
 
 
 def test_a_limb_that_slides_with_another_gain_feels_what_stops_it():
-    model = rubbing()
-    sense = TouchSense(model)
+    sense = TouchSense(rubbing())
     for k in range(180):
-        assert not sliding(sense, model, k / 30, -80.0 * k / 30).touched
-    pushed = [sliding(sense, model, k / 30, -80.0 * k / 30 - 900.0) for k in range(180, 186)]
+        assert not sliding(sense, k / 30, -80.0 * k / 30).touched
+    pushed = [sliding(sense, k / 30, -80.0 * k / 30 - 900.0) for k in range(180, 186)]
     assert pushed[-1].touched
 
 
 def test_what_the_estimator_says_in_surprise_is_no_touch():
-    model = rubbing()
-    sense = TouchSense(model)
+    sense = TouchSense(rubbing())
     for k in range(180):
-        sliding(sense, model, k / 30, 0.0)
-    sliding(sense, model, 6.0, 0.0, doubt=1000.0)
-    assert not sliding(sense, model, 6.0 + 1 / 30, 1200.0).touched
-    assert sliding(sense, model, 7.0, 1200.0).touched
+        sliding(sense, k / 30, 0.0)
+    sliding(sense, 6.0, 0.0, doubt=1000.0)
+    assert not sliding(sense, 6.0 + 1 / 30, 1200.0).touched
+    assert sliding(sense, 7.0, 1200.0).touched
 
 
 @pytest.mark.slow

@@ -19,7 +19,6 @@ import numpy as np
 
 from der_planner.arrays import Array
 from der_planner.control.knowledge import Knowledge
-from der_planner.control.nominal import Nominal
 from der_planner.limb import Limb
 
 _FREE_LEVEL = 250.0, 2e-3
@@ -79,35 +78,35 @@ class Lacking:
     stuck: Array
 
     @staticmethod
-    def of(time: float, nominal: Nominal, known: Knowledge, rate: Array, slid: Array) -> Lacking:
+    def of(
+        time: float, limb: Limb, known: Knowledge, bend: Array, rate: Array, slid: Array
+    ) -> Lacking:
         """Return what the estimator says that the model lacks.
 
         Args:
             time: [s].
-            nominal: the model's motion.
+            limb: of the model.
             known: the filter's state then.
-            rate: (M,) of bends, without what swings [rad/s].
-            slid: (M,) way that bends have gone since they turned round, with its sign [rad].
+            bend: (M,) bend angles of the limb [rad].
+            rate: (M,) of them, without what swings [rad/s].
+            slid: (M,) way that they have gone since they turned round, with its sign [rad].
         """
-        bend = nominal.at(time)[0]
-        inputs = len(bend)
+        inputs, turned = len(bend), known.memory.friction
         rows = np.zeros((inputs + 2, len(known.mean)))
         rows[:inputs, 2 * inputs : 3 * inputs] = np.eye(inputs)
         rows[:inputs, 3 * inputs : 4 * inputs] = np.diag(known.effective)
         rows[inputs:, 4 * inputs :] = np.eye(2)
         spread = rows @ known.covariance @ rows.T
-        bent, turned = bend + known.parts[0], known.memory.friction
-        still = _STICKS**2
         # A bend that goes the other way than its friction says has turned, and friction with it.
         goes_on = np.maximum(slid * np.sign(turned), 0.0)
-        sticks = np.maximum(still / (still + rate**2), np.exp(-goes_on / _SLIDES_AFTER))
+        slow = 1.0 / (1.0 + (rate / _STICKS) ** 2)
+        sticks = np.maximum(slow, np.exp(-goes_on / _SLIDES_AFTER))
         sticks = np.minimum(1.0, sticks + 1.0 - turned**2)
-        pressure, uneven = _friction(nominal.model.limb)
+        pressure, uneven = _friction(limb)
         spread[:inputs, :inputs] += _FRICTION_SLIDING * np.diag(pressure**2)
         spread[inputs:, inputs:] += (uneven**2 @ sticks) * np.eye(2)
         stuck = pressure * sticks * np.stack([turned - 1.0, turned + 1.0])
-        value = rows @ known.mean
-        return Lacking(time, bent, known.effective, turned, value, spread, stuck)
+        return Lacking(time, bend, known.effective, turned, rows @ known.mean, spread, stuck)
 
     @property
     def doubtful(self) -> Array:

@@ -43,7 +43,7 @@ _CORRELATED = 0.3
 _SWINGS = 0.1
 """Time in which swings are left out of the bends' rates [s]."""
 _FOLLOWS = 0.3
-"""Time in which the estimator follows friction that turned round [s]."""
+"""Time in which the estimator follows what it did not expect, as friction that turned round [s]."""
 _RELEASED = 0.5
 """Share of the threshold below which a touch ends."""
 _LEARNED_AFTER = 0.4
@@ -160,12 +160,13 @@ class TouchSense:
             known: the filter's state then.
         """
         passed = min(time - self.newest.time, _LONGEST)
-        rate = nominal.at(time)[1] + known.parts[1]
+        bend, rate, _ = nominal.at(time)
+        bend, rate = bend + known.parts[0], rate + known.parts[1]
         self._rate += (1.0 - np.exp(-passed / _SWINGS)) * (rate - self._rate)
         goes_on = self._rate * self._slid > 0.0
         self._slid = np.where(goes_on, self._slid, 0.0) + passed * rate
-        lacking = Lacking.of(time, nominal, known, self._rate, self._slid)
-        # The estimator follows what it did not expect, as friction that turned round, with a delay.
+        lacking = Lacking.of(time, self._model.limb, known, bend, self._rate, self._slid)
+        # What was in doubt is so for as long as the estimator takes to follow.
         kept = np.exp(-passed / _FOLLOWS)
         least, most = lacking.stuck
         self._stuck = np.stack(
