@@ -340,7 +340,7 @@ class BendFit:
         unknowns = self.free.unknowns
         self.search = LeastSquares(unknowns, self._rows, SOFTNESS / np.sqrt(CORRELATION))
 
-    def solve(self, start: Array) -> Array:
+    def solve(self, start: Array, most: int = MOST_FITS) -> Array:
         """Return the best values (P,), the bend angles weighed by the errors that these leave.
 
         With the errors taken for granted, a log that the model cannot explain would outweigh
@@ -349,12 +349,13 @@ class BendFit:
 
         Args:
             start: (P,) that the model follows.
+            most: number of searches with weights that an earlier one told.
 
         Raises:
             ValueError: the model cannot be followed at the start.
         """
         values = start
-        for _ in range(1 + MOST_FITS):
+        for _ in range(most if self._weighed else 1 + most):
             values = self.search.solve(values, TOLERANCE if self._weighed else ROUGH)
             before, known = self.errors, self._weighed
             self.weigh(np.maximum(self.errors_left(values), LEAST_ERRORS))

@@ -14,6 +14,7 @@ from der_planner.identification.air import AirFit, fit_air
 from der_planner.identification.bends import (
     COLUMN,
     GROUPS,
+    MOST_FITS,
     NODES,
     OPTIONAL,
     TERMS,
@@ -245,7 +246,9 @@ def _fit_bends(
     else:
         start = before.values
         problem.weigh(before.problem.errors)
-    values = problem.solve(_followed(problem, free, start))
+    # In turn with the lengths the weights are found, too, so that one search a pass will do.
+    most = 1 if known.weighs_in_plane else MOST_FITS
+    values = problem.solve(_followed(problem, free, start), most)
     return _Fitted(
         known, lengths, tips, problem, values, problem.remaining(values), free.limb_with(values)
     )
