@@ -340,16 +340,6 @@ def test_corrections_stay_while_something_touches_and_come_back_slowly(model, to
     assert came[-1] == pytest.approx(3500.0)
 
 
-def test_corrections_come_back_sooner_from_what_was_only_suspected(model):
-    reaction, first = Reaction(model, "yield"), np.array([500.0, -200.0])
-    reaction.corrected(first)
-    reaction.follow(CHAMBERS, untouched(1.0, np.zeros(2), distance=0.9), CHAMBERS)
-    np.testing.assert_array_equal(reaction.corrected(first + 3000.0), first)
-    reaction.follow(CHAMBERS, untouched(1.1, np.zeros(2)), CHAMBERS)
-    came = [reaction.corrected(first + 3000.0)[0] for _ in range(20)]
-    assert came[-1] == pytest.approx(3500.0)
-
-
 def test_what_is_no_reaction_is_refused(model):
     with pytest.raises(ValueError, match="warn, hold, yield, vent"):
         Reaction(model, "flee")

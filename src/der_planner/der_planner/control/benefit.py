@@ -31,12 +31,13 @@ _FORGET = 10.0
 """Time in which what corrections have brought is forgotten [s]."""
 _INDEPENDENT = 0.8
 """Time after which an instant says something new of the share [s]."""
-_DEVIATIONS = 1.5
-"""Number of its standard deviations that are taken off the share."""
+_DEVIATIONS, _DEVIATIONS_QUICK = 2.0, 1.0
+"""Number of its standard deviations that are taken off the share, and how many more in a quick
+motion: there what a correction brings differs most from one second to the next."""
 _RISES, _RISES_QUICK = 1.5, 3.0
 """Time in which the share may rise from none to all, and how much longer that takes in a quick
 motion: a sudden correction makes a limb swing [s]."""
-_QUICK = 1.0
+_QUICK = 0.8
 """Root mean square rate of a motion, over that of its bend, from which on nothing is trusted before
 it was seen [1/s]."""
 _TRUST, _TRUSTED = 0.008, 10.0
@@ -73,8 +74,9 @@ class Benefit:
         moved = nominal.bend - nominal.bend.mean(axis=0)
         rates = np.gradient(nominal.bend, CONTROL_PERIOD, axis=0)
         quick = float(np.sum(rates**2) / max(np.sum(moved**2), 1e-12)) / _QUICK**2
-        self._trust = max(0.0, 1.0 - quick)
+        self._trust = max(0.0, 1.0 - quick**2)
         self._rises = _RISES + (1.0 - self._trust) * _RISES_QUICK
+        self._deviations = _DEVIATIONS + (1.0 - self._trust) * _DEVIATIONS_QUICK
         worth = (_TRUST * nominal.model.limb.length) ** 2
         self._sums = self._trust * np.array([worth, worth, worth, _TRUSTED])
         self._prior = (_DOUBT * nominal.model.limb.length) ** 2
@@ -121,7 +123,7 @@ class Benefit:
         share = brought / (asked + self._prior)
         doubt = max(lacked - share * brought, 0.0) / (asked + self._prior)
         others = max(watched / _INDEPENDENT - 1.0, 1e-9)
-        share -= _DEVIATIONS * math.sqrt(doubt / others)
+        share -= self._deviations * math.sqrt(doubt / others)
         most = min(1.0, self.share + passed / self._rises)
         self.share = min(max(float(share), 0.0), most)
 

@@ -184,11 +184,11 @@ class Feedback:
                 swing = float(np.linalg.norm(known.parts[1]))
                 share = supervisor.advance(instant, age, known.strange)
                 if share > 0.0:
-                    wanted = share * self._horizon.solve(k, known)
+                    wanted = self._horizon.solve(k, known)
                     seen = round(self._estimator.newest / CONTROL_PERIOD)
                     shown = self._estimator.at(seen * CONTROL_PERIOD)
                     self._benefit.see(seen, self._estimator.gap(shown, seen))
-                    correction = self._benefit.share * wanted
+                    correction = share * self._benefit.share * wanted
         except np.linalg.LinAlgError:
             correction[:] = np.nan
         if not np.isfinite(correction).all():

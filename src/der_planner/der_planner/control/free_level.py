@@ -48,6 +48,10 @@ _FRICTION_WRONG = 0.75
 """Standard deviation of friction from its model where it turns round, over its largest."""
 _FRICTION_SLIDING = 0.0025
 """Its variance elsewhere, over the square of its largest."""
+_STILL = 0.5
+"""Share of the estimator's variance of what the model lacks that is noise of pictures: the other
+half lets it follow changes, of which a limb that nothing touches has few. With a gain K and noise r
+a random walk is known to K r, and what does not walk to K r / (2 − K)."""
 _STICKS = 0.01
 """Rate of a bend angle below which its segment may stick [rad/s]."""
 _SLIDES_AFTER = 0.1
@@ -96,7 +100,7 @@ class Lacking:
         rows[:inputs, 2 * inputs : 3 * inputs] = np.eye(inputs)
         rows[:inputs, 3 * inputs : 4 * inputs] = np.diag(known.effective)
         rows[inputs:, 4 * inputs :] = np.eye(2)
-        spread = rows @ known.covariance @ rows.T
+        spread = _STILL * rows @ known.covariance @ rows.T
         # A bend that goes the other way than its friction says has turned, and friction with it.
         goes_on = np.maximum(slid * np.sign(turned), 0.0)
         slow = 1.0 / (1.0 + (rate / _STICKS) ** 2)

@@ -1,7 +1,7 @@
 """What is done about a touch: warn, hold, yield or vent.
 
-Against what touches, the tip stays behind whatever is corrected. From before a touch is sure,
-`yield` leaves corrections what they were; once it has ended they come back slowly.
+Against what touches, the tip stays behind whatever is corrected: corrections stay what they were,
+and come back slowly once the touch has ended, since the plan may press on what the limb has left.
 
 A touch is worth an effective pressure ℓ per segment (`Touch.pressure`): bending further against it
 raises the force. A change δu of the pressures in the chambers does so as far as −ℓ·δu > 0. While
@@ -28,11 +28,8 @@ from der_planner.model import CONTROL_PERIOD, RodModel
 
 Kind = Literal["warn", "hold", "yield", "vent"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
-_SUSPECTED = 0.6
-"""`Touch.distance` from which on corrections stay what they were."""
-_RETURN = 1.0, 4.0
-"""Time in which corrections come back once a touch is no longer suspected, and once one has ended:
-the plan may press on what the limb has just left [s]."""
+_RETURN = 4.0
+"""Time in which corrections come back once a touch has ended [s]."""
 _SMALLEST = 1e-9
 """A pressure below this gives no direction [Pa]."""
 
@@ -57,8 +54,7 @@ class Reaction:
         self.kind, self.limit = kind, limit
         self._held: Array | None = None
         self._bound = np.zeros(model.inputs), 0.0
-        self._suspected = False
-        self._free, self._kept, self._return = 1.0, np.zeros(model.inputs), _RETURN[0]
+        self._free, self._kept = 1.0, np.zeros(model.inputs)
 
     @property
     def acts(self) -> bool:
@@ -78,7 +74,6 @@ class Reaction:
             touch: as it is known now.
             chambers: (M,) differential pressures in them now [Pa].
         """
-        self._suspected = self.acts and touch.distance > _SUSPECTED and not touch.weighed
         harder, bound = self._bound
         if touch.weighed or not (touch.touched and self.acts):
             if self.limit is None or not (self.kind == "yield" and harder @ planned > bound):
@@ -103,13 +98,12 @@ class Reaction:
 
     def corrected(self, wanted: Array) -> Array:
         """Return the correction (M,) [Pa] of this control period in place of a wanted one."""
-        if self._held is not None or self._suspected:
-            self._return = _RETURN[1] if self._held is not None else self._return
+        if self._held is not None:
             self._free = 0.0
         else:
-            self._free = min(1.0, self._free + CONTROL_PERIOD / self._return)
+            self._free = min(1.0, self._free + CONTROL_PERIOD / _RETURN)
             if self._free == 1.0:
-                self._kept, self._return = wanted, _RETURN[0]
+                self._kept = wanted
         return self.mixed(wanted)
 
     def allowed(self, wanted: Array) -> Array:
