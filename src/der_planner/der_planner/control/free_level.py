@@ -69,7 +69,7 @@ class Lacking:
         friction: (M,) z, −1 … 1.
         value: (M + 2,) pressure that the model lacks [Pa], and the tip's displacement that the
             bend angles do not explain [m].
-        covariance: of value, where friction is what its model says.
+        covariance: of value, where nothing changes and friction is what its model says.
         stuck: (2, M) least and most of value that friction explains of segments that stick [Pa].
     """
 

@@ -139,7 +139,7 @@ def rest_along(time: Array, driven: Array, stiffer: Array, law: RestingLaw, begi
             keep[i] = np.exp(-rate)
             share[i] = (1.0 - keep[i]) / rate
         last = bend[k - 1]
-        if k > 1:
+        if k > 1:  # most often it goes on as before, and the search is short
             angle += last - bend[k - 2]
         balance(angle, law, Instant(driven[k], stiffer[k], last, z, q, keep, share))
         for i in range(count):
