@@ -164,7 +164,7 @@ def test_a_gain_that_drops_is_made_up_for(planned, corrected):
     without = corrected[0]
     hit = (played.time > 4.2) & (played.time < 5.0)
     assert played.error[hit].max() > without.error[hit].max() + 0.004
-    late = played.time > 6.0
+    late = played.time > 8.0
     assert played.error[late].mean() < 1.3 * without.error[late].mean()
 
 

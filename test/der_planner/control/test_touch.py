@@ -205,17 +205,19 @@ def test_what_friction_may_hide_of_a_touch_does_not_end_it(model):
     assert not TouchSense(model, calibrated()).look(now).touched
 
 
-def sliding(sense, time, missing, doubt=40.0):
+def sliding(sense, time, missing, doubt=40.0, mass=0.0):
     """Feel a limb that bends by 0.1 rad/s, with rates that are hardly known, and lacks pressure.
 
     Args:
         time: [s].
         missing: effective pressure of the first segment [Pa].
         doubt: its standard deviation [Pa].
+        mass: M_w of each segment [Pa s²].
     """
     bend, none = np.full(2, 0.1 * time), np.zeros(2)
     swings = 0.08 * np.cos(40.0 * time)
-    nominal = SimpleNamespace(at=lambda _: (bend, np.full(2, 0.1), none))
+    at, masses = (bend, np.full(2, 0.1), none), mass * np.ones((300, 1, 1)) * np.eye(2)
+    nominal = SimpleNamespace(at=lambda _: at, periods=int, mass=masses)
     mean = np.array([0.0, 0.0, swings, swings, missing, 0.0, 0.0, 0.0, 0.0, 0.0])
     deviation = np.repeat([2e-3, 0.08, doubt, 1e-3, 1e-4], 2)
     memory = Memory(bend, np.ones(2), none)
@@ -229,6 +231,15 @@ def test_a_limb_that_slides_with_another_gain_feels_what_stops_it():
         assert not sliding(sense, k / 30, -80.0 * k / 30).touched
     pushed = [sliding(sense, k / 30, -80.0 * k / 30 - 900.0) for k in range(180, 186)]
     assert pushed[-1].touched
+
+
+@pytest.mark.parametrize(("mass", "touched"), [(0.0, True), (1000.0, False)])
+def test_what_the_mass_of_a_limb_that_swings_may_take_is_no_touch(mass, touched):
+    sense = TouchSense(rubbing())
+    for k in range(180):
+        sliding(sense, k / 30, 0.0, mass=mass)
+    felt = [sliding(sense, k / 30, -700.0, mass=mass) for k in range(180, 186)]
+    assert felt[-1].touched is touched
 
 
 def test_what_the_estimator_says_in_surprise_is_no_touch():

@@ -12,7 +12,7 @@ less by some of its standard deviations, and within 0 … 1. e is that of a limb
 pressures without swinging, since statics are calibrated; what swings is smoothed away on both
 sides. Where a disturbance changes faster than it can be seen and made up for, or corrections bend
 the limb otherwise than the model, they come in the wrong phase, α falls, and the plan is left
-alone. P keeps α at zero until something was seen.
+alone. Nothing is sent on trust: P keeps α at zero until something was seen.
 """
 
 from __future__ import annotations
@@ -34,19 +34,16 @@ _INDEPENDENT = 0.8
 _DEVIATIONS, _DEVIATIONS_QUICK = 2.0, 1.0
 """Number of its standard deviations that are taken off the share, and how many more in a quick
 motion: there what a correction brings differs most from one second to the next."""
-_RISES, _RISES_QUICK = 1.5, 3.0
+_RISES, _RISES_QUICK = 1.0, 3.0
 """Time in which the share may rise from none to all, and how much longer that takes in a quick
 motion: a sudden correction makes a limb swing [s]."""
 _QUICK = 0.8
-"""Root mean square rate of a motion, over that of its bend, from which on nothing is trusted before
-it was seen [1/s]."""
-_TRUST, _TRUSTED = 0.008, 10.0
-"""What the slowest motion begins with: √(Σ e² / 1 s) over the length, and for how long [s]."""
+"""Root mean square rate of a motion, over that of its bend, from which on it is quick [1/s]."""
 _OUTLYING = 9.0
 """An instant counts as much as one that leaves so many times the usual squared error, at most."""
-_LEAST_TRUST = 0.1
-"""Added to the trust in two motions before they are compared."""
-_DOUBT = 0.002
+_LEAST_SLOW = 0.1
+"""Added to how slow two motions are before they are compared."""
+_DOUBT = 0.001
 """√(P / 1 s), over the limb's length."""
 
 
@@ -70,15 +67,14 @@ class Benefit:
         self._pressure = np.zeros((2, inputs))
         self._held: dict[int, Array] = {}
         self._smooth = np.zeros((2, 2, 2))
-        # Of −alone·wanted, wanted², alone² and 1 over time: what is slow is trusted at first.
+        # Of −alone·wanted, wanted², alone² and 1 over time.
+        self._sums = np.zeros(4)
         moved = nominal.bend - nominal.bend.mean(axis=0)
         rates = np.gradient(nominal.bend, CONTROL_PERIOD, axis=0)
         quick = float(np.sum(rates**2) / max(np.sum(moved**2), 1e-12)) / _QUICK**2
-        self._trust = max(0.0, 1.0 - quick**2)
-        self._rises = _RISES + (1.0 - self._trust) * _RISES_QUICK
-        self._deviations = _DEVIATIONS + (1.0 - self._trust) * _DEVIATIONS_QUICK
-        worth = (_TRUST * nominal.model.limb.length) ** 2
-        self._sums = self._trust * np.array([worth, worth, worth, _TRUSTED])
+        self._slow = max(0.0, 1.0 - quick**2)
+        self._rises = _RISES + (1.0 - self._slow) * _RISES_QUICK
+        self._deviations = _DEVIATIONS + (1.0 - self._slow) * _DEVIATIONS_QUICK
         self._prior = (_DOUBT * nominal.model.limb.length) ** 2
         self._seen = -1
         self.share = 0.0
@@ -86,9 +82,9 @@ class Benefit:
     def take_over(self, other: Benefit) -> None:
         """Begin with what the corrections of another plan of this limb have brought.
 
-        What a slower motion has told counts as much less as this one is trusted less at first.
+        What a slower motion has told counts as much less as this one is quicker.
         """
-        kept = min(1.0, (self._trust + _LEAST_TRUST) / (other._trust + _LEAST_TRUST))
+        kept = min(1.0, (self._slow + _LEAST_SLOW) / (other._slow + _LEAST_SLOW))
         self._sums, self.share = kept * other._sums, other.share
         self._pressure = other._pressure
 

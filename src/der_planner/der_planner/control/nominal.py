@@ -83,6 +83,7 @@ class Nominal:
             that does not say what its chambers hold beyond their model.
         fine_transition, fine_input: (K', 2M, 2M) and (K', 2M, M) of (δθ, δθ̇) in one fine step.
         transition, input: the same of a control period.
+        mass: (K', M, M) M_w [Pa s²].
     """
 
     def __init__(self, plan: Plan) -> None:
@@ -199,6 +200,7 @@ class Nominal:
         fine, whole = expm(system * STEP), expm(system * CONTROL_PERIOD)
         self.fine_transition, self.fine_input = fine[:, :both, :both], fine[:, :both, both:]
         self.transition, self.input = whole[:, :both, :both], whole[:, :both, both:]
+        self.mass = mass
 
 
 def _held(rows: Array) -> Array:

@@ -34,7 +34,7 @@ from der_planner.arrays import Array
 from der_planner.control.free_level import FreeLevel, Lacking
 from der_planner.control.knowledge import Knowledge
 from der_planner.control.nominal import Nominal
-from der_planner.model import RodModel
+from der_planner.model import CONTROL_PERIOD, RodModel
 from der_planner.model.compliance import compliance
 
 _HOUR = 3600.0
@@ -42,6 +42,8 @@ _CORRELATED = 0.3
 """Time after which what the model lacks says something new [s]."""
 _SWINGS = 0.1
 """Time in which swings are left out of the bends' rates [s]."""
+_INERTIA_WRONG = 0.5
+"""Standard deviation of the pressure that makes the limb's mass swing, over that pressure."""
 _FOLLOWS = 0.3
 """Time in which the estimator follows what it did not expect, as friction that turned round [s]."""
 _RELEASED = 0.5
@@ -172,9 +174,12 @@ class TouchSense:
         self._stuck = np.stack(
             [np.minimum(least, kept * self._stuck[0]), np.maximum(most, kept * self._stuck[1])]
         )
-        variance = np.diag(lacking.covariance)
+        swings = (rate - self._rate) / _SWINGS
+        moved_by = nominal.mass[nominal.periods(round(time / CONTROL_PERIOD))] @ swings
+        told = np.diag(lacking.covariance)
+        variance = told + np.append(_INERTIA_WRONG * moved_by, np.zeros(2)) ** 2
         self._variance = np.maximum(variance, kept**2 * self._variance)
-        spread = lacking.covariance + np.diag(self._variance - variance)
+        spread = lacking.covariance + np.diag(self._variance - told)
         return self.look(replace(lacking, stuck=self._stuck, covariance=spread))
 
     def look(self, lacking: Lacking) -> Touch:
