@@ -34,7 +34,7 @@ _INDEPENDENT = 0.8
 _DEVIATIONS, _DEVIATIONS_QUICK = 2.0, 1.0
 """Number of its standard deviations that are taken off the share, and how many more in a quick
 motion: there what a correction brings differs most from one second to the next."""
-_RISES, _RISES_QUICK = 1.0, 3.0
+_RISES, _RISES_QUICK = 1.5, 3.0
 """Time in which the share may rise from none to all, and how much longer that takes in a quick
 motion: a sudden correction makes a limb swing [s]."""
 _QUICK = 0.8
