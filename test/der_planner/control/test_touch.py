@@ -216,8 +216,8 @@ def sliding(sense, time, missing, doubt=40.0, mass=0.0):
     """
     bend, none = np.full(2, 0.1 * time), np.zeros(2)
     swings = 0.08 * np.cos(40.0 * time)
-    at, masses = (bend, np.full(2, 0.1), none), mass * np.ones((300, 1, 1)) * np.eye(2)
-    nominal = SimpleNamespace(at=lambda _: at, periods=int, mass=masses)
+    at = bend, np.full(2, 0.1), none
+    nominal = SimpleNamespace(at=lambda _: at, periods=lambda _: 0, mass=[mass * np.eye(2)])
     mean = np.array([0.0, 0.0, swings, swings, missing, 0.0, 0.0, 0.0, 0.0, 0.0])
     deviation = np.repeat([2e-3, 0.08, doubt, 1e-3, 1e-4], 2)
     memory = Memory(bend, np.ones(2), none)
