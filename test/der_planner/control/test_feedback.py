@@ -199,6 +199,19 @@ def test_another_motion_takes_over_without_a_jump(planned):
     assert np.mean(errors) < 0.025 * LENGTH
 
 
+def test_the_next_run_remembers_what_corrections_bring(planned):
+    feedback, errors = Feedback(planned), []
+    for run in range(2):
+        if run:
+            earlier, feedback = feedback, Feedback(planned)
+            feedback.remember(earlier)
+        plant = Chain()
+        plant.chain.change_gain(0.8)
+        played = play(planned, plant, feedback)
+        errors.append(played.error[(played.time > 2.0) & (played.time < 6.0)].mean())
+    assert errors[1] < 0.7 * errors[0]
+
+
 def test_lost_tags_lead_back_to_the_plan(planned):
     plant = Chain()
     plant.chain.change_gain(0.7)
@@ -229,7 +242,7 @@ def test_a_limb_that_needs_much_and_follows_is_not_left(planned):
     played = play(planned, plant, feedback)
     authority = 0.4 * planned.limb.pneumatics.pressure_limit
     at_limit = np.abs(played.correction).max(axis=1) > 0.98 * authority
-    assert at_limit.sum() > 50
+    assert at_limit.sum() > 10
     assert not feedback.warnings
 
 

@@ -98,6 +98,17 @@ def test_what_cannot_be_told_is_not_told(model):
     assert np.isnan(two.place)
 
 
+def test_a_limb_that_is_known_from_an_earlier_run_feels_more_though_it_rests_otherwise(model):
+    rests, felt = np.array([300.0, -200.0, 1e-3, 0.0]), []
+    hit = lacking(model, {15: (0.0, 0.1)})
+    for free in (FreeLevel(LIMB), calibrated().another_run()):
+        sense = TouchSense(model, free)
+        for k in range(60):
+            assert not sense.look(replace(KNOWN, time=k / 30, value=rests)).touched
+        felt.append(sense.look(replace(hit, time=2.0, value=hit.value + rests)).touched)
+    assert felt == [False, True]
+
+
 def test_a_touch_ends_and_the_next_one_has_a_time_of_its_own(model):
     sense, hit = TouchSense(model, calibrated()), lacking(model, {20: (0.0, 0.2)})
     nothing = replace(hit, value=np.zeros(4))

@@ -28,6 +28,25 @@ def test_pictures_from_the_future_are_left_out_and_named_once():
     assert "pictures come from 30 ms in the future" in text
 
 
+def test_a_plan_from_rest_begins_with_what_the_one_before_has_told():
+    from unittest.mock import Mock
+
+    from der_planner.nodes.planner_feedback import Corrector
+
+    corrector = Corrector(Mock(), Mock(), lambda: 0, Mock())
+    first, second = Mock(), Mock()
+    for feedback in (first, second):
+        schedule = Mock(count=5)
+        schedule.plan.reference.start = None
+        corrector.follow(schedule, feedback)
+    begun = corrector._open[-1]
+    assert begun.begins(0)
+    assert begun.begins(1)
+    corrector.close()
+    second.remember.assert_called_once_with(first)
+    second.take_over.assert_not_called()
+
+
 def test_a_touch_is_published_and_drawn_while_it_lasts():
     from dataclasses import replace
     from unittest.mock import Mock

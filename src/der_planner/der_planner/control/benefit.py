@@ -27,11 +27,11 @@ from der_planner.model import CONTROL_PERIOD
 
 _SMOOTH = 0.3
 """Time constant of the two low-passes in front of the sums [s]."""
-_FORGET = 10.0
+_FORGET = 20.0
 """Time in which what corrections have brought is forgotten [s]."""
 _INDEPENDENT = 0.8
 """Time after which an instant says something new of the share [s]."""
-_DEVIATIONS, _DEVIATIONS_QUICK = 2.0, 1.0
+_DEVIATIONS, _DEVIATIONS_QUICK = 2.0, 1.5
 """Number of its standard deviations that are taken off the share, and how many more in a quick
 motion: there what a correction brings differs most from one second to the next."""
 _RISES, _RISES_QUICK = 1.5, 3.0
@@ -79,8 +79,15 @@ class Benefit:
         self._seen = -1
         self.share = 0.0
 
+    def remember(self, other: Benefit) -> None:
+        """Begin with what corrections brought in an earlier run of this limb.
+
+        The quicker the motion, the less of that holds again.
+        """
+        self._sums = self._slow * other._sums
+
     def take_over(self, other: Benefit) -> None:
-        """Begin with what the corrections of another plan of this limb have brought.
+        """Go on where the corrections of another plan of this limb were.
 
         What a slower motion has told counts as much less as this one is quicker.
         """

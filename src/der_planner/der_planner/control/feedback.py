@@ -105,6 +105,14 @@ class Feedback:
         """(time [s], squared normalised distance, coordinates) of every measurement."""
         return self._estimator.innovations
 
+    def remember(self, earlier: Feedback) -> None:
+        """Begin with what an earlier run of this limb has told of it.
+
+        That is how far the model is off where nothing touches the limb, and what corrections bring.
+        """
+        self._sense.free = earlier._sense.free.another_run()
+        self._benefit.remember(earlier._benefit)
+
     def take_over(self, other: Feedback, time: float) -> None:
         """Go on where the feedback of another plan of this limb was, before anything is told.
 

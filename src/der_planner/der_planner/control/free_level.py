@@ -13,6 +13,7 @@ harder: what holds it harder is a touch.
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -169,6 +170,13 @@ class FreeLevel:
         self.noise = noise**2
         self._covariance[:, -1, -1] = _WANDERS * self.noise
         self._worth = _FIRST_WORTH
+
+    def another_run(self) -> FreeLevel:
+        """Return what is known of the limb in its next run: it may rest and be loaded otherwise."""
+        after = copy.deepcopy(self)
+        after.payload = 0.0
+        after._covariance[:, 0, 0] += np.repeat(_FREE_LEVEL, [len(self.noise) - 2, 2]) ** 2
+        return after
 
     def expected(self, lacking: Lacking, ahead: float = 0.0) -> tuple[Array, Array]:
         """Return mean and variance (M + 2,), noise and all.

@@ -43,6 +43,9 @@ _CHANGE = 5e-6
 """λ, tip error that a unit change of a correction is worth [m/Pa]."""
 _CHANGE_LEARNED = 2e-5
 """λ on a learned plan, which makes up for what repeats, so that corrections may be slow [m/Pa]."""
+_BACK = 20
+"""Control periods within which the slew limit must let commands come back to the plan. A correction
+that cannot be taken back, as the plan vents as fast as it can, makes the limb late."""
 _SHARES = (1.0, 0.5, 0.2)
 """Shares of the programme's change that are tried, in this order."""
 _ROUNDING = 1e-6
@@ -150,10 +153,11 @@ class Horizon:
         """Return the change (knots·M,) of the knots [Pa] that is best within all limits."""
         air, guess = self._air.pneumatics, here.correction
         planned = self._planned(here.first)
+        least, most = self._bounds(here.first)
         bounds: Array = np.stack(
             [
-                np.maximum(-self._authority, -air.pressure_limit - planned) - guess,
-                np.minimum(self._authority, air.pressure_limit - planned) - guess,
+                np.maximum(least, -air.pressure_limit - planned) - guess,
+                np.minimum(most, air.pressure_limit - planned) - guess,
             ]
         )
         low, high = np.sort(bounds, axis=0)
@@ -204,6 +208,13 @@ class Horizon:
         lacking: Array = -(missing + gain * planned) / np.maximum(1.0 + gain, 0.3)
         return lacking
 
+    def _bounds(self, first: int) -> tuple[Array, Array]:
+        """Return the least and the largest correction (W, M) [Pa]: authority, and see `_BACK`."""
+        moves = self._planned(first + _BACK) - self._planned(first)
+        back = self._air.pneumatics.slew_limit * CONTROL_PERIOD * _BACK
+        least = np.clip(moves - back, -self._authority, 0.0)
+        return least, np.clip(moves + back, 0.0, self._authority)
+
     def _planned(self, first: int) -> Array:
         """Return the plan's commands (W, M) from a control period on [Pa]."""
         return self._nominal.commands[self._nominal.periods(first + np.arange(self.window))]
@@ -214,7 +225,7 @@ class Horizon:
         What is rolled forward must be what can be sent.
         """
         planned = self._planned(first)
-        wanted = planned + np.clip(correction, -self._authority, self._authority)
+        wanted = planned + np.clip(correction, *self._bounds(first))
         commands, _ = within_limits(
             wanted, self._air, CONTROL_PERIOD, self._chambers.sent(first - 1)
         )

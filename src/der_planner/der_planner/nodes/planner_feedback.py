@@ -47,13 +47,18 @@ class _Corrected:
         schedule: what is played.
         feedback: of its plan.
         left: the schedule that gives way to this one; None: this one begins at rest.
+        earlier: feedback of the schedule before.
     """
 
     def __init__(
-        self, schedule: Schedule, feedback: Feedback, left: _Corrected | None = None
+        self,
+        schedule: Schedule,
+        feedback: Feedback,
+        left: _Corrected | None,
+        earlier: Feedback | None,
     ) -> None:
         self.schedule, self.feedback = schedule, feedback
-        self._left = left
+        self._left, self._earlier = left, earlier
         self.coming: tuple[int, Array] = feedback.coming()
         self.revisions: dict[int, int] = {}
         self.warned = 0
@@ -72,6 +77,9 @@ class _Corrected:
         if self._left is not None:
             left, self._left = self._left, None
             self.feedback.take_over(left.feedback, left.time_of(self.schedule.start))
+        elif self._earlier is not None:
+            self.feedback.remember(self._earlier)
+        self._earlier = None
         return True
 
     def tell(self, told: list[Callable[[_Corrected], None]], alone: bool) -> None:
@@ -127,6 +135,7 @@ class Corrector:
         self._wake = threading.Condition()
         self._inbox: deque[Callable[[_Corrected], None]] = deque(maxlen=200)
         self._open: list[_Corrected] = []
+        self._last: Feedback | None = None
         self._seen = self._closed = self._was_ahead = False
         self._took = 0.01
         self._thread = threading.Thread(target=self._run, name="feedback", daemon=True)
@@ -143,7 +152,8 @@ class Corrector:
         with self._wake:
             goes_on = self._open and schedule.plan.reference.start is not None
             left = self._open[-1] if goes_on else None
-            self._open.append(_Corrected(schedule, feedback, left))
+            self._open.append(_Corrected(schedule, feedback, left, self._last))
+            self._last = feedback
             self._wake.notify_all()
 
     def forget(self, schedule: Schedule) -> None:
