@@ -10,14 +10,14 @@ limb's own damping. The corrections c (W, M), added to the plan's commands, then
     Σ |tip − r̄|² + ν² Σ |δθ|² + λ² Σ |r_k − r_{k−1}|² + λ² Σ |r_k − 2 r_{k−1} + r_{k−2}|²
 
 where r is c less what makes up for the disturbances d and g, which are known ahead, with |command|
-within the pressure limit, its change within the slew limit and |c| within the authority. ν keeps
-the segments near the model's bend where the tip hardly tells them apart. The chambers' law, with
-its slow venting, is linearised about the commands rolled forward. The change that the programme
-finds, a half and a fifth of it are then rolled forward by the law itself, cut to commands that can
-be sent, and the first that makes the sum less is taken, or none. Corrections are straight lines
-between a few knots, close together at first, so that the programme has some thirty unknowns. The
-horizon is longer than a chamber takes to vent: what a shorter one gains now it pays for after its
-end.
+within the pressure limit, its change within the slew limit, |c| within the authority, and no c from
+which the slew limit keeps commands from the plan for longer than a second. ν keeps the segments
+near the model's bend where the tip hardly tells them apart. The chambers' law, with its slow
+venting, is linearised about the commands rolled forward. The change that the programme finds, a
+half and a fifth of it are then rolled forward by the law itself, cut to commands that can be sent,
+and the first that makes the sum less is taken, or none. Corrections are straight lines between a
+few knots, close together at first, so that the programme has some thirty unknowns. The horizon is
+longer than a chamber takes to vent: what a shorter one gains now it pays for after its end.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ _CHANGE = 5e-6
 _CHANGE_LEARNED = 2e-5
 """λ on a learned plan, which makes up for what repeats, so that corrections may be slow [m/Pa]."""
 _BACK = 20
-"""Control periods within which the slew limit must let commands come back to the plan. A correction
-that cannot be taken back, as the plan vents as fast as it can, makes the limb late."""
+"""Control periods within which the slew limit must let commands come back to the plan: where that
+fills or vents as fast as it may, a correction that stays makes the limb late."""
 _SHARES = (1.0, 0.5, 0.2)
 """Shares of the programme's change that are tried, in this order."""
 _ROUNDING = 1e-6
