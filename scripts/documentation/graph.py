@@ -18,7 +18,7 @@ from rclpy.parameter import parameter_value_to_python
 from der_planner.experiment.client import GraphClient
 from der_planner.experiment.console import Progress
 from der_planner.experiment.graph_run import running_graph
-from der_planner.experiment.processes import GraphSetup, NodeProcess
+from der_planner.experiment.processes import GraphError, GraphSetup, NodeProcess
 from limb_interfaces import topics
 from workspace_setup.basics import ROOT
 
@@ -101,12 +101,20 @@ def _quality(ends: list[Any], name: str) -> str:
     return ", ".join(words)
 
 
+def _asked(client: GraphClient, kind: Any, service: str, **request: Any) -> Any:
+    """Return an answer; one that is lost is asked for again, which does no harm here."""
+    try:
+        return client.ask(kind, service, timeout=5.0, **request)
+    except GraphError:
+        return client.ask(kind, service, **request)
+
+
 def _parameters(client: GraphClient, name: str, given: dict[str, Any]) -> list[dict[str, Any]]:
     """Return name, default, range and description of each parameter, by their names."""
-    listed = client.ask(ListParameters, f"{name}/list_parameters").result.names
+    listed = _asked(client, ListParameters, f"{name}/list_parameters").result.names
     names = sorted(item for item in listed if not item.startswith(OF_ROS))
-    described = client.ask(DescribeParameters, f"{name}/describe_parameters", names=names)
-    values = client.ask(GetParameters, f"{name}/get_parameters", names=names).values
+    described = _asked(client, DescribeParameters, f"{name}/describe_parameters", names=names)
+    values = _asked(client, GetParameters, f"{name}/get_parameters", names=names).values
     found = []
     for item, value in zip(described.descriptors, values, strict=True):
         limits = [*item.floating_point_range, *item.integer_range]
