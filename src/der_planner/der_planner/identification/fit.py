@@ -25,6 +25,7 @@ from der_planner.identification.bends import (
 )
 from der_planner.identification.lengths import (
     GeometryFit,
+    GivesWayError,
     UnevenTips,
     fit_geometry,
     lengths_at_their_end,
@@ -62,6 +63,10 @@ SHORTEST_DELAY = 0.005
 STIFFER_STARTS = (0.0, 0.25, 0.5, 0.9)
 """Added to the logarithm of the stiffness, or taken off that of the mass, until the rod can follow
 the log from there."""
+_NO_CUBIC = (
+    "the cubic term is left out: with it the limb that fits the log best gives way under its "
+    "pressures, since under gravity that term is hardly told from stiffness and rest angle"
+)
 
 
 def fit(
@@ -128,7 +133,13 @@ def _fit(
         warnings.append(f"the chambers' lag keeps its old value: {error}")
     offset = 0.0 if air is None else air.offset
     prepared = replace(recorded, pressure=recorded.pressure - offset)
-    fitted = _fit_bends_and_lengths(limb, prepared, groups)
+    try:
+        fitted = _fit_bends_and_lengths(limb, prepared, groups)
+    except GivesWayError:
+        if "cubic" not in groups:
+            raise
+        fitted = _fit_bends_and_lengths(limb, prepared, set(groups) - {"cubic"})
+        warnings.append(_NO_CUBIC)
     warnings += filter(None, [lengths_at_their_end(limb, fitted.known)])
     if hung is not None:
         change, deviation = hung.stiffness_change(fitted.known, fitted.limb)

@@ -46,11 +46,10 @@ MOST_TIPS = 800
 """Rows with tips, evenly chosen, to which lengths are fitted."""
 _NUDGE = 1e-6
 """Change of a length for the slope of the tip [m]."""
-GIVES_WAY = (
-    "the limb that fits the log best gives way under the pressures of the log: its stiffness falls "
-    "too far as it bends. Fit it without that term (--terms without 'cubic'), or record a log with "
-    "smaller pressures"
-)
+
+
+class GivesWayError(LogError):
+    """A limb whose stiffness falls so far as it bends that it gives way to the log's pressures."""
 
 
 @dataclass(frozen=True)
@@ -121,11 +120,6 @@ def fit_geometry(
 def unevenness(limb: Limb, log: Prepared, nodes: int) -> tuple[Array, Array]:
     """Return how unevenly its weight bends a limb along a log, as its tip shows it.
 
-    A limb whose stiffness falls as it bends may give way in the rod of the planners, whose many
-    nodes see a sharper bend at the clamp, although the rod of the fit follows the log. Then the rod
-    of the fit tells it alone and lacks nothing: the next fit has better lengths, and by them a
-    better stiffness.
-
     Args:
         limb: that was fitted.
         log: with the differential pressures inside the chambers.
@@ -135,27 +129,27 @@ def unevenness(limb: Limb, log: Prepared, nodes: int) -> tuple[Array, Array]:
         Tip (K, 2) less that of evenly bent segments, and what the rod of the fit lacks of it [m].
 
     Raises:
-        LogError: not even the rod of the fit follows the log.
+        GivesWayError: see `uneven_tip`.
     """
-    coarse = uneven_tip(limb, log, nodes)
-    try:
-        whole = uneven_tip(limb, log)
-    except LogError:
-        whole = coarse
-    return whole, whole - coarse
+    whole = uneven_tip(limb, log)
+    return whole, whole - uneven_tip(limb, log, nodes)
 
 
 def uneven_tip(limb: Limb, log: Prepared, nodes: int = NODES) -> Array:
     """Return the tip (K, 2) of a limb along a log, less that at evenly bent segments [m].
 
     Raises:
-        LogError: the limb gives way under the pressures of the log.
+        GivesWayError: the limb gives way. The rod of the planners, whose many nodes see a sharper
+            bend at the clamp, may do so where the rod of the fit follows the log.
     """
     model = RodModel(limb, nodes)
     try:
         response = follow(model, log)
     except ConvergenceError as error:
-        raise LogError(GIVES_WAY) from error
+        raise GivesWayError(
+            "the limb that fits the log best gives way under its pressures: record a log with "
+            "smaller pressures"
+        ) from error
     return np.asarray(response.tip - model.kinematics.tip(response.bend_angles))
 
 
