@@ -75,7 +75,7 @@ class Reaction:
             chambers: (M,) differential pressures in them now [Pa].
         """
         harder, bound = self._bound
-        if touch.weighed or not (touch.touched and self.acts):
+        if not (touch.touched and self.acts):
             if self.limit is None or not (self.kind == "yield" and harder @ planned > bound):
                 self._held = None
             return

@@ -16,9 +16,10 @@ gives place and force with what is in doubt of them.
 Without contact the same numbers are not zero either (`der_planner.control.free_level`). A distance
 from that free level which noise would pass once in an hour is a touch.
 
-What begins at once to pull at the tip along gravity, and goes on, is a payload: it is weighed,
-belongs to the free level from then on, and is not a touch. So is one that is taken off. Where
-gravity has no part in the plane, a payload cannot be told.
+What begins at once to pull at the tip along gravity, and pulls the same while the limb goes on, is
+a payload: it is weighed, belongs to the free level from then on, and is not a touch. So is one that
+is taken off. Until then it is a touch: something fixed may push the same way. Where gravity has no
+part in the plane, a payload cannot be told.
 """
 
 from __future__ import annotations
@@ -70,8 +71,10 @@ _UNEVEN = 0.02
 _SETTLES = 0.3
 """Time in which a payload pulls as much as later: it comes at once, contact grows [s]."""
 _WEIGHED = 0.7
-"""Time for which a payload pulls the same [s]."""
-_TOLD_BY = 4.0
+"""Time for which a payload pulls the same, at least [s]."""
+_MOVED = 0.5
+"""Change of the pressures against a payload in that time, over the pressure that it is worth."""
+_TOLD_BY = 10.0
 """Time after which a touch is no payload [s]."""
 _SAME_WEIGHT = 0.3
 """Change of the pull, over it, up to which it is the same."""
@@ -149,7 +152,7 @@ class TouchSense:
         self._rate, self._slid = np.zeros((2, model.inputs))
         self._stuck, self._variance = np.zeros((2, model.inputs)), np.zeros(model.inputs + 2)
         self._recent: deque[tuple[Lacking, float, Array, Array]] = deque()
-        self._weighed: list[tuple[float, float, bool]] = []
+        self._weighed: list[tuple[float, float, bool, Array]] = []
         self._learned = self._calm = -np.inf
         self._earlier: list[tuple[FreeLevel, float]] = []
 
@@ -289,15 +292,18 @@ class TouchSense:
         mass = float(weight @ inverse @ away.value) / pull
         left = float(away.value @ inverse @ away.value) - mass**2 * pull
         alone = left < _chance(_UNLIKELY**2, len(weight) - 1)
-        self._weighed.append((age, mass, alone))
-        ages, masses, alones = np.array(self._weighed).T
-        newest = ages > age - _WEIGHED
-        mean = float(masses[newest].mean())
-        grew = np.abs(masses[ages < _SETTLES]).max() < (1.0 - _SAME_WEIGHT) * abs(mean)
+        self._weighed.append((age, mass, alone, away.effective))
+        ages, masses, alones, effective = map(np.array, zip(*self._weighed, strict=True))
+        settled = ages >= min(age, _SETTLES)
+        mean = float(masses[settled].mean())
+        grew = np.abs(masses[ages <= _SETTLES]).max() < (1.0 - _SAME_WEIGHT) * abs(mean)
         taken_off = mean + self.free.payload < -_SAME_WEIGHT * abs(mean)
-        perhaps = age < _TOLD_BY and not grew and not taken_off and (alone or age < _SETTLES)
-        same = np.ptp(masses[newest]) < _SAME_WEIGHT * abs(mean)
-        told = perhaps and same and bool(alones[newest].all()) and age > _SETTLES + _WEIGHED
+        same = np.ptp(masses[settled]) < _SAME_WEIGHT * abs(mean) and bool(alones[settled].all())
+        perhaps = age < _TOLD_BY and not grew and not taken_off and (same or age < _SETTLES)
+        # What is fixed would push otherwise by now.
+        pushed = mean * weight[: effective.shape[1]]
+        moved = np.ptp(effective[settled] @ pushed) > _MOVED * float(pushed @ pushed)
+        told = perhaps and moved and age > _SETTLES + _WEIGHED
         if told:
             self.free.payload = max(0.0, self.free.payload + mean)
         return told, perhaps
