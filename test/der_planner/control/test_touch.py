@@ -150,46 +150,39 @@ def test_a_stiffness_that_is_wrong_under_gravity_is_no_touch():
     assert not any(found[240:])
 
 
-def test_a_payload_is_weighed_and_what_is_fixed_or_grows_is_not():
+def test_a_payload_is_weighed_and_what_the_limb_is_driven_against_is_not():
     tilted = RodModel(LIMB.mounted("20"))
     hung = lacking(tilted, {20: 0.06 * np.array(tilted.limb.gravity[:2])})
 
-    def watched(sense, begin, shares, moves=1.0):
-        more = moves * hung.value[:2]
+    def watched(sense, begin, shares, driven=0.0):
+        more = driven * hung.value[:2]
         return [
             sense.look(
                 replace(
                     hung,
                     time=begin + k / 30,
                     value=share * hung.value,
-                    effective=hung.effective + k / 60 * more,
+                    effective=hung.effective - share * more,
                 )
             )
             for k, share in enumerate(shares)
         ]
 
-    sense, all_at_once = TouchSense(tilted, calibrated()), np.repeat([0.0, 1.0], [5, 60])
-    put_on = watched(sense, 0.0, all_at_once)
+    sense = TouchSense(tilted, calibrated())
+    put_on = watched(sense, 0.0, np.repeat([0.0, 1.0], [5, 60]))
     assert put_on[8].touched
     assert put_on[8].weighed
     assert not put_on[-1].touched
     assert put_on[-1].payload == pytest.approx(0.06, rel=0.1)
-    taken_off = watched(sense, 3.0, np.zeros(60))
+    taken_off = watched(sense, 3.0, np.repeat([0.5, 0.0], [10, 20]))
     assert not taken_off[-1].touched
-    assert taken_off[-1].payload == pytest.approx(0.0, abs=0.006)
-    # At rest nobody can tell a payload from something that is fixed.
-    waits = watched(TouchSense(tilted, calibrated()), 0.0, all_at_once, moves=0.0)
-    assert waits[-1].touched
-    assert waits[-1].weighed
-    # A force that answers to what the limb does is none; nor is one that grows.
-    fixed = watched(
-        TouchSense(tilted, calibrated()), 0.0, all_at_once - 0.6 * np.arange(65) / 60 * all_at_once
-    )
-    grown = watched(TouchSense(tilted, calibrated()), 0.0, np.linspace(0.0, 2.0, 60))
-    for pushed in (fixed, grown):
-        assert pushed[-1].touched
-        assert not pushed[-1].weighed
-        assert pushed[-1].payload == 0.0
+    assert taken_off[-1].payload == 0.0
+    # Something fixed takes what the limb is driven with, and pushes as a payload pulls.
+    reached = np.concatenate([np.linspace(0.0, 1.0, 20), np.ones(60)])
+    fixed = watched(TouchSense(tilted, calibrated()), 0.0, reached, driven=1.0)
+    assert fixed[-1].touched
+    assert not any(touch.weighed for touch in fixed)
+    assert fixed[-1].payload == 0.0
 
 
 def rubbing() -> RodModel:

@@ -16,9 +16,9 @@ gives place and force with what is in doubt of them.
 Without contact the same numbers are not zero either (`der_planner.control.free_level`). A distance
 from that free level which noise would pass once in an hour is a touch.
 
-What begins at once to pull at the tip along gravity, and pulls the same while the limb goes on, is
-a payload: it is weighed, belongs to the free level from then on, and is not a touch. So is one that
-is taken off. Until then it is a touch: something fixed may push the same way. Where gravity has no
+What begins at once to pull at the tip along gravity, and goes on, is a payload: it is weighed,
+belongs to the free level from then on, and is not a touch. So is one that is taken off. Something
+fixed may push the same way, but no faster than the limb is driven against it. Where gravity has no
 part in the plane, a payload cannot be told.
 """
 
@@ -68,13 +68,14 @@ _EFFECT_WRONG = 0.1
 """Standard deviation of what a weight or a force is said to do, over that."""
 _UNEVEN = 0.02
 """The same of how far the tip moves beside its bend, over how far the bend moves it."""
-_SETTLES = 0.3
-"""Time in which a payload pulls as much as later: it comes at once, contact grows [s]."""
+_AT_ONCE = 0.5
+"""Time in which a payload has come when it is noticed [s]."""
+_FASTER = 1.3
+"""What a payload changes in that time, over what pressures do: something fixed presses no faster
+than the limb is driven against it."""
 _WEIGHED = 0.7
-"""Time for which a payload pulls the same, at least [s]."""
-_MOVED = 0.5
-"""Change of the pressures against a payload in that time, over the pressure that it is worth."""
-_TOLD_BY = 10.0
+"""Time for which a payload pulls the same [s]."""
+_TOLD_BY = 4.0
 """Time after which a touch is no payload [s]."""
 _SAME_WEIGHT = 0.3
 """Change of the pull, over it, up to which it is the same."""
@@ -152,7 +153,9 @@ class TouchSense:
         self._rate, self._slid = np.zeros((2, model.inputs))
         self._stuck, self._variance = np.zeros((2, model.inputs)), np.zeros(model.inputs + 2)
         self._recent: deque[tuple[Lacking, float, Array, Array]] = deque()
-        self._weighed: list[tuple[float, float, bool, Array]] = []
+        self._newest: deque[Lacking] = deque()
+        self._weighed: list[tuple[float, float, bool]] = []
+        self._came_at_once = False
         self._learned = self._calm = -np.inf
         self._earlier: list[tuple[FreeLevel, float]] = []
 
@@ -188,10 +191,13 @@ class TouchSense:
     def look(self, lacking: Lacking) -> Touch:
         """Return what a newer instant says of a touch."""
         before = self.newest
+        self._newest.append(lacking)
+        while self._newest[0].time < lacking.time - _AT_ONCE:
+            self._newest.popleft()
         away, variance = self._away(lacking, self.free, self._learned)
         distance = self._distance(away, away.covariance)
         touched = distance > (_RELEASED if before.touched else 1.0)
-        if touched and not before.touched and self._lets_go(lacking, away.covariance):
+        if touched and self._lets_go(lacking, away.covariance):
             away, variance = self._away(lacking, self.free, self._learned)
             distance, touched = self._distance(away, away.covariance), False
         if distance < _RELEASED:
@@ -247,10 +253,10 @@ class TouchSense:
         return float(left @ np.linalg.solve(noise, left)) / self.threshold
 
     def _lets_go(self, lacking: Lacking, noise: Array) -> bool:
-        """Return whether what seems to begin is the end of a touch, and go back to its free level.
+        """Return whether what seems to touch is the end of something, and go back to its free level.
 
-        What was left of the force, when it seemed to be over, has been learned meanwhile. The noise
-        is today's: a level of which little was known would explain any touch.
+        What was left of a force has been learned meanwhile, or a payload is taken off. The noise is
+        today's: a level of which little was known would explain any touch.
 
         Args:
             lacking: of the model.
@@ -263,8 +269,9 @@ class TouchSense:
                 del self._earlier[place + 1 :]
                 self._recent.clear()
                 return True
-        self._earlier.append((copy.deepcopy(self.free), self._learned))
-        del self._earlier[:-_EARLIER]
+        if not self.newest.touched:
+            self._earlier.append((copy.deepcopy(self.free), self._learned))
+            del self._earlier[:-_EARLIER]
         return False
 
     def _weight_effect(self, bend_angles: Array) -> Array:
@@ -274,6 +281,13 @@ class TouchSense:
         effect = effects(self._model, bend_angles, self._places[-1:])[0]
         weight: Array = effect @ np.array(self._model.limb.gravity[:2])
         return weight
+
+    def _comes_at_once(self) -> bool:
+        """Return whether what is lacking changed faster than pressures did."""
+        first, last = self._newest[0], self._newest[-1]
+        change = (last.value - first.value)[: len(last.effective)]
+        driven = abs(float(change @ (last.effective - first.effective)))
+        return float(change @ change) > _FASTER * driven
 
     def _weighs(self, away: Lacking, age: float) -> tuple[bool, bool]:
         """Return whether what touches is a payload, and whether it may yet turn out to be one.
@@ -286,24 +300,21 @@ class TouchSense:
         """
         if age == 0.0:
             self._weighed.clear()
+            self._came_at_once = self._comes_at_once()
         weight = self._weight_effect(away.bend_angles)
         inverse = np.linalg.inv(away.doubtful + np.diag((_EFFECT_WRONG * away.value) ** 2))
         pull = float(weight @ inverse @ weight)
         mass = float(weight @ inverse @ away.value) / pull
         left = float(away.value @ inverse @ away.value) - mass**2 * pull
         alone = left < _chance(_UNLIKELY**2, len(weight) - 1)
-        self._weighed.append((age, mass, alone, away.effective))
-        ages, masses, alones, effective = map(np.array, zip(*self._weighed, strict=True))
-        settled = ages >= min(age, _SETTLES)
-        mean = float(masses[settled].mean())
-        grew = np.abs(masses[ages <= _SETTLES]).max() < (1.0 - _SAME_WEIGHT) * abs(mean)
+        self._weighed.append((age, mass, alone))
+        ages, masses, alones = np.array(self._weighed).T
+        newest = ages > age - _WEIGHED
+        mean = float(masses[newest].mean())
         taken_off = mean + self.free.payload < -_SAME_WEIGHT * abs(mean)
-        same = np.ptp(masses[settled]) < _SAME_WEIGHT * abs(mean) and bool(alones[settled].all())
-        perhaps = age < _TOLD_BY and not grew and not taken_off and (same or age < _SETTLES)
-        # What is fixed would push otherwise by now.
-        pushed = mean * weight[: effective.shape[1]]
-        moved = np.ptp(effective[settled] @ pushed) > _MOVED * float(pushed @ pushed)
-        told = perhaps and moved and age > _SETTLES + _WEIGHED
+        perhaps = self._came_at_once and age < _TOLD_BY and not taken_off
+        same = np.ptp(masses[newest]) < _SAME_WEIGHT * abs(mean)
+        told = perhaps and same and bool(alones[newest].all()) and age > _WEIGHED
         if told:
             self.free.payload = max(0.0, self.free.payload + mean)
         return told, perhaps
