@@ -253,7 +253,7 @@ class TouchSense:
         return float(left @ np.linalg.solve(noise, left)) / self.threshold
 
     def _lets_go(self, lacking: Lacking, noise: Array) -> bool:
-        """Return whether what seems to touch is the end of something, and go back to its free level.
+        """Return whether what seems to touch is the end of something; go back to its free level.
 
         What was left of a force has been learned meanwhile, or a payload is taken off. The noise is
         today's: a level of which little was known would explain any touch.
