@@ -153,7 +153,7 @@ class TouchSense:
         self._rate, self._slid = np.zeros((2, model.inputs))
         self._stuck, self._variance = np.zeros((2, model.inputs)), np.zeros(model.inputs + 2)
         self._recent: deque[tuple[Lacking, float, Array, Array]] = deque()
-        self._newest: deque[Lacking] = deque()
+        self._lately: deque[Lacking] = deque()
         self._weighed: list[tuple[float, float, bool]] = []
         self._came_at_once = False
         self._learned = self._calm = -np.inf
@@ -191,9 +191,9 @@ class TouchSense:
     def look(self, lacking: Lacking) -> Touch:
         """Return what a newer instant says of a touch."""
         before = self.newest
-        self._newest.append(lacking)
-        while self._newest[0].time < lacking.time - _AT_ONCE:
-            self._newest.popleft()
+        self._lately.append(lacking)
+        while self._lately[0].time < lacking.time - _AT_ONCE:
+            self._lately.popleft()
         away, variance = self._away(lacking, self.free, self._learned)
         distance = self._distance(away, away.covariance)
         touched = distance > (_RELEASED if before.touched else 1.0)
@@ -284,7 +284,7 @@ class TouchSense:
 
     def _comes_at_once(self) -> bool:
         """Return whether what is lacking changed faster than pressures did."""
-        first, last = self._newest[0], self._newest[-1]
+        first, last = self._lately[0], self._lately[-1]
         change = (last.value - first.value)[: len(last.effective)]
         driven = abs(float(change @ (last.effective - first.effective)))
         return float(change @ change) > _FASTER * driven
