@@ -177,6 +177,12 @@ def test_a_payload_is_weighed_and_what_the_limb_is_driven_against_is_not():
     taken_off = watched(sense, 3.0, np.repeat([0.5, 0.0], [10, 20]))
     assert not taken_off[-1].touched
     assert taken_off[-1].payload == 0.0
+    # A hand comes slowly, though pressures stay.
+    shares = np.concatenate([np.linspace(0.0, 2.0, 60), np.full(40, 2.0)])
+    hand = watched(TouchSense(tilted, calibrated()), 0.0, shares)
+    assert hand[-1].touched
+    assert not hand[-1].weighed
+    assert hand[-1].payload == 0.0
     # Something fixed takes what the limb is driven with, and pushes as a payload pulls.
     reached = np.concatenate([np.linspace(0.0, 1.0, 20), np.ones(60)])
     fixed = watched(TouchSense(tilted, calibrated()), 0.0, reached, driven=1.0)

@@ -69,10 +69,12 @@ _EFFECT_WRONG = 0.1
 _UNEVEN = 0.02
 """The same of how far the tip moves beside its bend, over how far the bend moves it."""
 _AT_ONCE = 0.5
-"""Time in which a payload has come when it is noticed [s]."""
+"""Time over which what is lacking and pressures are compared when a touch is noticed [s]."""
 _FASTER = 1.3
 """What a payload changes in that time, over what pressures do: something fixed presses no faster
 than the limb is driven against it."""
+_CAME = 0.3
+"""Time in which a payload has come once it is noticed [s]."""
 _WEIGHED = 0.7
 """Time for which a payload pulls the same [s]."""
 _TOLD_BY = 4.0
@@ -312,7 +314,9 @@ class TouchSense:
         newest = ages > age - _WEIGHED
         mean = float(masses[newest].mean())
         taken_off = mean + self.free.payload < -_SAME_WEIGHT * abs(mean)
-        perhaps = self._came_at_once and age < _TOLD_BY and not taken_off
+        # What a hand presses with comes slowly, though the limb is not driven.
+        grew = np.abs(masses[ages <= _CAME]).max() < (1.0 - _SAME_WEIGHT) * abs(mean)
+        perhaps = self._came_at_once and age < _TOLD_BY and not (taken_off or grew)
         same = np.ptp(masses[newest]) < _SAME_WEIGHT * abs(mean)
         told = perhaps and same and bool(alones[newest].all()) and age > _WEIGHED
         if told:
