@@ -25,6 +25,8 @@ _PIECES = 4
 """Straight pieces of a segment that carry its weight."""
 _ROUNDS = 200
 """Sweeps over the segments at the most; without weight one is enough."""
+_CLOSE = 1e-8
+"""Change of a bend angle in a sweep with which its balance is found [rad]."""
 _LARGEST_STEP = 0.3
 """Of a bend angle in one iteration [rad]."""
 _LARGEST_BEND = 6.0
@@ -107,10 +109,13 @@ def weigh(angle: Array, law: RestingLaw, torque: Array, slope: Array) -> None:
         turns = weight.lever[e] * (x * weight.gravity[1] - y * weight.gravity[0])
         falls = -weight.lever[e] * (x * weight.gravity[0] + y * weight.gravity[1])
         for i in range(count):
-            torque[i] += weight.turning[e, i] * turns / law.stiffness[i]
+            torque[i] += weight.turning[e, i] * turns
             for j in range(count):
                 share = weight.turning[e, i] * weight.turning[e, j]
-                slope[i, j] += share * falls / law.stiffness[i]
+                slope[i, j] += share * falls
+    for i in range(count):
+        torque[i] /= law.stiffness[i]
+        slope[i] /= law.stiffness[i]
 
 
 @njit(cache=True)
@@ -190,7 +195,7 @@ def balance(angle: Array, law: RestingLaw, instant: Instant) -> None:
                 step = min(max(step, -_LARGEST_STEP), _LARGEST_STEP)
             angle[i] = before[i] + step
             moved = max(moved, abs(step))
-        if not heavy or moved < 1e-10:
+        if not heavy or moved < _CLOSE:
             return
 
 
