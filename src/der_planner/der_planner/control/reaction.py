@@ -55,6 +55,7 @@ class Reaction:
         self._held: Array | None = None
         self._bound = np.zeros(model.inputs), 0.0
         self._free, self._kept = 1.0, np.zeros(model.inputs)
+        self._newest = self._kept
 
     @property
     def acts(self) -> bool:
@@ -98,13 +99,12 @@ class Reaction:
 
     def corrected(self, wanted: Array) -> Array:
         """Return the correction (M,) [Pa] of this control period in place of a wanted one."""
-        if self._held is not None:
-            self._free = 0.0
-        else:
+        if self._held is None:
             self._free = min(1.0, self._free + CONTROL_PERIOD / _RETURN)
-            if self._free == 1.0:
-                self._kept = wanted
-        return self.mixed(wanted)
+        elif self._free > 0.0:
+            self._free, self._kept = 0.0, self._newest
+        self._newest = self.mixed(wanted)
+        return self._newest
 
     def allowed(self, wanted: Array) -> Array:
         """Return the command (M,) [Pa] in place of a wanted one."""

@@ -79,6 +79,8 @@ _WEIGHED = 0.7
 """Time for which a payload pulls the same [s]."""
 _TOLD_BY = 4.0
 """Time after which a touch is no payload [s]."""
+_PAYLOAD_WRONG = 0.2
+"""Standard deviation of a payload that was weighed, over it: friction bears a part."""
 _SAME_WEIGHT = 0.3
 """Change of the pull, over it, up to which it is the same."""
 _LEAST_GRAVITY = 1.0
@@ -240,11 +242,10 @@ class TouchSense:
         if touch.touched:
             ahead -= (1.0 - _TOUCHED_FORGETS) * (lacking.time - touch.since)
         mean, variance = free.expected(lacking, ahead)
-        value = lacking.value - mean
-        if free.payload:
-            value -= free.payload * self._weight_effect(lacking.bend_angles)
+        weight = free.payload * self._weight_effect(lacking.bend_angles)
         covariance = lacking.covariance + np.diag(variance)
-        return replace(lacking, value=value, covariance=covariance), variance
+        covariance += _PAYLOAD_WRONG**2 * np.outer(weight, weight)
+        return replace(lacking, value=lacking.value - mean - weight, covariance=covariance), variance
 
     def _distance(self, away: Lacking, noise: Array) -> float:
         """Return the squared distance from the free level, over that of a touch.
@@ -267,8 +268,11 @@ class TouchSense:
         for place, earlier in enumerate(self._earlier):
             away, _ = self._away(lacking, *earlier)
             if self._distance(away, noise) < _RELEASED:
+                left = self.free, self._learned
                 self.free, self._learned = copy.deepcopy(earlier)
                 del self._earlier[place + 1 :]
+                if left[0].payload:  # it may only seem to be off
+                    self._earlier.append(left)
                 self._recent.clear()
                 return True
         if not self.newest.touched:
