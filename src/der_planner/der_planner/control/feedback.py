@@ -112,6 +112,7 @@ class Feedback:
         """
         self._sense.free = earlier._sense.free.another_run()
         self._benefit.remember(earlier._benefit)
+        self._supervisor.swings = earlier._supervisor.swings
 
     def take_over(self, other: Feedback, time: float) -> None:
         """Go on where the feedback of another plan of this limb was, before anything is told.
@@ -130,6 +131,7 @@ class Feedback:
         self._sense.free = other._sense.free
         # What ended the other's feedback does not count here.
         self._supervisor.share = other.share
+        self._supervisor.swings = other._supervisor.swings
 
     def pressures(self, time: float, differential: ArrayLike) -> None:
         """Take in the chambers' differential pressures (M,) [Pa], as measured at an instant [s].
@@ -182,21 +184,19 @@ class Feedback:
             supervisor.in_time()
         planned, before = self._nominal.command(k), self._chambers.sent(k - 1)
         correction = wanted = np.zeros_like(planned)
-        swing = 0.0
         try:
             # Matrices of some ten rows: more threads only get into other processes' way.
             with _THREADS.limit(limits=1, user_api="blas"):
                 known = self._estimator.at(instant)
                 self._feel()
                 age = instant - self._estimator.newest
-                swing = float(np.linalg.norm(known.parts[1]))
                 share = supervisor.advance(instant, age, known.strange)
                 if share > 0.0:
                     wanted = self._horizon.solve(k, known)
                     seen = round(self._estimator.newest / CONTROL_PERIOD)
                     shown = self._estimator.at(seen * CONTROL_PERIOD)
                     self._benefit.see(seen, self._estimator.gap(shown, seen))
-                    correction = share * self._benefit.share * wanted
+                    correction = supervisor.calmed(instant, share * self._benefit.share * wanted)
         except np.linalg.LinAlgError:
             correction[:] = np.nan
         if not np.isfinite(correction).all():
@@ -207,7 +207,6 @@ class Feedback:
         self._reaction.follow(planned, self.touch, chambers)
         allowed = self._reaction.allowed(planned + self._reaction.corrected(correction))
         command: Array = within_limits(allowed[None], air, CONTROL_PERIOD, before)[0][0]
-        supervisor.sent(instant, command - planned, swing)
         self._benefit.sent(k, command - planned, wanted)
         self._chambers.send(k, command)
         self._estimator.changed(instant)

@@ -1,10 +1,10 @@
 """Decides on the share of feedback's corrections that is sent.
 
 It goes from 0 to 1 once the limb is seen, and back to 0, which is the plan alone, where feedback
-can do harm: the camera sees nothing, or what it sees does not fit the model; corrections swing on
-and on; commands are asked for too late. Lost tags may come back; after the other reasons the rest
-of the run is played without feedback. Corrections that a limb does not follow lose their share by
-`der_planner.control.benefit`.
+can do harm: the camera sees nothing, or what it sees does not fit the model; commands are asked for
+too late. Lost tags may come back; after the other reasons the rest of the run is played without
+feedback. Once corrections have swung, what is slow in them is sent. Corrections that a limb does not
+follow lose their share by `der_planner.control.benefit`.
 """
 
 from __future__ import annotations
@@ -20,14 +20,13 @@ from der_planner.model import CONTROL_PERIOD
 REASONS = {
     "tags lost": "the limb has not been seen for {:.1f} s",
     "inconsistent": "the limb moves as the model cannot, measurements are {:.0f} times too far off",
-    "oscillation": "corrections swing by {:.0f} Pa, and neither they nor the limb come to rest",
+    "swings": "corrections swing by {:.0f} Pa, what is slow in them is sent from now on: does the limb "
+    "swing as its file says? Calibrate it again",
     "late": "commands come {:.2f} s after their instant",
     "pressures": "chambers are said to hold {:.3g} Pa, which no command has made: are pressures "
     "told in Pa, and is the supply open?",
 }
 """Every reason with the sentence of its warning."""
-_GOES_ON = 0.7
-"""Share of its largest swing below which something that swings begins or dies out."""
 _RAMP = 1.0
 """Time in which feedback comes in [s]."""
 _FADE = 1.5
@@ -40,12 +39,14 @@ _INCONSISTENT = 20.0
 """Squared distance of measurements per coordinate, smoothed, that is too large; 1 is expected."""
 _PATIENCE = 2.0
 """Time for which measurements may be inconsistent [s]."""
-_SWING = 0.1
-"""Way from one turn of a swinging correction to the next, as a share of the authority."""
-_TURNS = 6
-"""Number of turns within the window that are an oscillation, unless it begins or dies out."""
-_WINDOW = 4.0
-"""Time in which the turns are counted [s]."""
+_SLOW = 0.5
+"""Time in which corrections go to another level [s]."""
+_SWING = 0.02
+"""Distance from that level beyond which it swings, as a share of the authority."""
+_TURNS = 3
+"""Number of turns within the window that are a swing; friction that turns round makes one."""
+_WINDOW = 1.5
+"""Time in which they are counted [s]."""
 _STRANGE = 1.5
 """Time for which chambers may be said to hold what no command has made [s]."""
 _LATE = 4.0
@@ -75,19 +76,21 @@ class Supervisor:
 
     Attributes:
         share: 0 … 1.
+        swings: whether corrections have swung.
         reason: for which feedback is out or going out; empty while it acts.
         warnings: all that were given.
     """
 
     def __init__(self, authority: float) -> None:
         self.authority = authority
-        self.share = 0.0
+        self.share, self.swings = 0.0, False
         self.reason = ""
         self.warnings: list[Warned] = []
         self._latched = False
         self._since: dict[str, float] = {}
         self._late = 0.0
-        self._recent: deque[tuple[Array, float]] = deque(maxlen=round(_WINDOW / CONTROL_PERIOD))
+        self._slow = np.zeros(1)
+        self._fast: deque[Array] = deque(maxlen=round(_WINDOW / CONTROL_PERIOD))
 
     def advance(self, time: float, age: float, strange: float) -> float:
         """Return the share of a command's correction.
@@ -110,18 +113,23 @@ class Supervisor:
             self.share = min(1.0, self.share + CONTROL_PERIOD / _RAMP)
         return self.share
 
-    def sent(self, time: float, correction: Array, swing: float) -> None:
-        """Look at a correction that is sent.
+    def calmed(self, time: float, correction: Array) -> Array:
+        """Return what is sent of a correction (M,) [Pa] for an instant [s].
 
-        Args:
-            time: instant of the command [s].
-            correction: (M,) [Pa].
-            swing: rate at which the limb deviates from the model's motion then [rad/s].
+        Friction, loads and a wrong gain take corrections to another level. On a limb whose swing is
+        not what the model says they go up and down, and drive it: less of what is fast is sent.
         """
-        self._recent.append((correction, swing))
-        distance = self._oscillation()
-        if distance > 0.0:
-            self.stop(time, "oscillation", distance)
+        self._fast.append(correction - self._slow)
+        self._slow = self._slow + CONTROL_PERIOD / _SLOW * self._fast[-1]
+        if self.swings:
+            return self._slow
+        for series in np.array(self._fast).T:
+            far = series[np.abs(series) > _SWING * self.authority]
+            if np.count_nonzero(np.diff(np.sign(far))) >= _TURNS:
+                self.swings = True
+                self.warnings.append(Warned(time, "swings", REASONS["swings"].format(np.ptp(far))))
+                break
+        return correction
 
     def held(self, time: float, pressure: float, possible: bool) -> None:
         """Look at what chambers are said to hold [Pa], and whether commands can have made it."""
@@ -134,27 +142,6 @@ class Supervisor:
             self._since.pop(what, None)
             return 0.0
         return time - self._since.setdefault(what, time)
-
-    def _oscillation(self) -> float:
-        """Return how far a correction swings [Pa] if it and the limb swing on and on; else 0.
-
-        After a push they swing more than before, and later less. A correction that is cut at its
-        limit swings as far as before while the limb's swing dies out.
-        """
-        if len(self._recent) < (self._recent.maxlen or 0):
-            return 0.0
-        corrections, swings = (np.array(each) for each in zip(*self._recent, strict=True))
-        third, least = len(swings) // 3, _SWING * self.authority
-        if min(swings[:third].max(), swings[-third:].max()) < _GOES_ON * swings.max():
-            return 0.0
-        for series in corrections.T:
-            distance = float(np.ptp(series))
-            away = series - (series.max() + series.min()) / 2
-            sides = np.sign(away[np.abs(away) > least / 2])
-            goes_on = min(np.ptp(series[:third]), np.ptp(series[-third:])) >= _GOES_ON * distance
-            if goes_on and np.count_nonzero(np.diff(sides)) >= _TURNS:
-                return distance
-        return 0.0
 
     def late(self, time: float, by: float) -> None:
         """Note that a command came after its instant [s], and by how much [s]."""
