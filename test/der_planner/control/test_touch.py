@@ -191,6 +191,22 @@ def test_a_payload_is_weighed_and_what_the_limb_is_driven_against_is_not():
     assert fixed[-1].payload == 0.0
 
 
+def test_a_payload_that_was_weighed_is_known_again_and_may_be_a_little_more():
+    tilted = RodModel(LIMB.mounted("20"))
+    hung = lacking(tilted, {20: 0.02 * np.array(tilted.limb.gravity[:2])})
+    sense = TouchSense(tilted, calibrated())
+    shares = np.repeat([0.0, 1.0, 0.0, 1.0, 1.2], [5, 60, 20, 5, 20])
+    felt = [
+        sense.look(replace(hung, time=k / 30, value=share * hung.value))
+        for k, share in enumerate(shares)
+    ]
+    assert felt[6].touched
+    assert felt[64].payload == pytest.approx(0.02, rel=0.1)
+    assert felt[84].payload == 0.0
+    assert not any(touch.touched for touch in felt[85:])
+    assert felt[-1].payload == felt[64].payload
+
+
 def rubbing() -> RodModel:
     """Return a limb whose friction is worth 900 Pa."""
     segments = [
@@ -376,6 +392,14 @@ def test_corrections_stay_while_something_touches_and_come_back_slowly(model, to
     came = [reaction.corrected(first + 3000.0)[0] for _ in range(80)]
     assert np.all(np.diff(came) > 0.0)
     assert came[-1] == pytest.approx(3500.0)
+    # Touched again on the way back, they stay where they are: a jump would make the limb swing.
+    reaction.follow(CHAMBERS, touch, CHAMBERS)
+    reaction.corrected(first)
+    reaction.follow(CHAMBERS, untouched(4.0, np.zeros(2)), CHAMBERS)
+    for _ in range(40):
+        halfway = reaction.corrected(first + 3000.0)
+    reaction.follow(CHAMBERS, touch, CHAMBERS)
+    np.testing.assert_array_equal(reaction.corrected(first + 3000.0), halfway)
 
 
 def test_what_is_no_reaction_is_refused(model):

@@ -3,8 +3,8 @@
 It goes from 0 to 1 once the limb is seen, and back to 0, which is the plan alone, where feedback
 can do harm: the camera sees nothing, or what it sees does not fit the model; commands are asked for
 too late. Lost tags may come back; after the other reasons the rest of the run is played without
-feedback. Once corrections have swung, what is slow in them is sent. Corrections that a limb does not
-follow lose their share by `der_planner.control.benefit`.
+feedback. Once corrections have swung, only what is slow in them is sent. Corrections that a limb
+does not follow lose their share by `der_planner.control.benefit`.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from der_planner.model import CONTROL_PERIOD
 REASONS = {
     "tags lost": "the limb has not been seen for {:.1f} s",
     "inconsistent": "the limb moves as the model cannot, measurements are {:.0f} times too far off",
-    "swings": "corrections swing by {:.0f} Pa, what is slow in them is sent from now on: does the limb "
-    "swing as its file says? Calibrate it again",
+    "swings": "corrections swing by {:.0f} Pa, what is slow in them is sent from now on: does the "
+    "limb swing as its file says? Calibrate it again",
     "late": "commands come {:.2f} s after their instant",
     "pressures": "chambers are said to hold {:.3g} Pa, which no command has made: are pressures "
     "told in Pa, and is the supply open?",
@@ -117,7 +117,7 @@ class Supervisor:
         """Return what is sent of a correction (M,) [Pa] for an instant [s].
 
         Friction, loads and a wrong gain take corrections to another level. On a limb whose swing is
-        not what the model says they go up and down, and drive it: less of what is fast is sent.
+        not what the model says they go up and down, and drive it.
         """
         self._fast.append(correction - self._slow)
         self._slow = self._slow + CONTROL_PERIOD / _SLOW * self._fast[-1]

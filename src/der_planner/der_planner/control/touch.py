@@ -201,7 +201,7 @@ class TouchSense:
         away, variance = self._away(lacking, self.free, self._learned)
         distance = self._distance(away, away.covariance)
         touched = distance > (_RELEASED if before.touched else 1.0)
-        if touched and self._lets_go(lacking, away.covariance):
+        if touched and self._lets_go(lacking, variance):
             away, variance = self._away(lacking, self.free, self._learned)
             distance, touched = self._distance(away, away.covariance), False
         if distance < _RELEASED:
@@ -243,9 +243,10 @@ class TouchSense:
             ahead -= (1.0 - _TOUCHED_FORGETS) * (lacking.time - touch.since)
         mean, variance = free.expected(lacking, ahead)
         weight = free.payload * self._weight_effect(lacking.bend_angles)
+        value = lacking.value - mean - weight
         covariance = lacking.covariance + np.diag(variance)
         covariance += _PAYLOAD_WRONG**2 * np.outer(weight, weight)
-        return replace(lacking, value=lacking.value - mean - weight, covariance=covariance), variance
+        return replace(lacking, value=value, covariance=covariance), variance
 
     def _distance(self, away: Lacking, noise: Array) -> float:
         """Return the squared distance from the free level, over that of a touch.
@@ -255,7 +256,7 @@ class TouchSense:
         left = away.value if self.newest.touched else away.beside_friction
         return float(left @ np.linalg.solve(noise, left)) / self.threshold
 
-    def _lets_go(self, lacking: Lacking, noise: Array) -> bool:
+    def _lets_go(self, lacking: Lacking, variance: Array) -> bool:
         """Return whether what seems to touch is the end of something; go back to its free level.
 
         What was left of a force has been learned meanwhile, or a payload is taken off. The noise is
@@ -263,11 +264,11 @@ class TouchSense:
 
         Args:
             lacking: of the model.
-            noise: (M + 2, M + 2) covariance of what is away from the newest free level.
+            variance: (M + 2,) of the newest free level.
         """
         for place, earlier in enumerate(self._earlier):
-            away, _ = self._away(lacking, *earlier)
-            if self._distance(away, noise) < _RELEASED:
+            away, told = self._away(lacking, *earlier)
+            if self._distance(away, away.covariance + np.diag(variance - told)) < _RELEASED:
                 left = self.free, self._learned
                 self.free, self._learned = copy.deepcopy(earlier)
                 del self._earlier[place + 1 :]
