@@ -174,6 +174,8 @@ def test_a_payload_is_weighed_and_what_the_limb_is_driven_against_is_not():
     assert put_on[8].weighed
     assert not put_on[-1].touched
     assert put_on[-1].payload == pytest.approx(0.06, rel=0.1)
+    # Friction may have borne a part of it.
+    assert not any(touch.touched for touch in watched(sense, 2.2, np.full(10, 1.2)))
     taken_off = watched(sense, 3.0, np.repeat([0.5, 0.0], [10, 20]))
     assert not taken_off[-1].touched
     assert taken_off[-1].payload == 0.0
@@ -191,11 +193,11 @@ def test_a_payload_is_weighed_and_what_the_limb_is_driven_against_is_not():
     assert fixed[-1].payload == 0.0
 
 
-def test_a_payload_that_was_weighed_is_known_again_and_may_be_a_little_more():
+def test_a_payload_that_was_weighed_is_known_again():
     tilted = RodModel(LIMB.mounted("20"))
     hung = lacking(tilted, {20: 0.02 * np.array(tilted.limb.gravity[:2])})
     sense = TouchSense(tilted, calibrated())
-    shares = np.repeat([0.0, 1.0, 0.0, 1.0, 1.2], [5, 60, 20, 5, 20])
+    shares = np.repeat([0.0, 1.0, 0.0, 1.0], [5, 60, 20, 5])
     felt = [
         sense.look(replace(hung, time=k / 30, value=share * hung.value))
         for k, share in enumerate(shares)
