@@ -108,7 +108,8 @@ class Feedback:
     def remember(self, earlier: Feedback) -> None:
         """Begin with what an earlier run of this limb has told of it.
 
-        That is how far the model is off where nothing touches the limb, and what corrections bring.
+        That is how far the model is off where nothing touches the limb, what corrections bring, and
+        whether they swing.
         """
         self._sense.free = earlier._sense.free.another_run()
         self._benefit.remember(earlier._benefit)
