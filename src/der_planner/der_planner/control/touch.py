@@ -242,10 +242,11 @@ class TouchSense:
         if touch.touched:
             ahead -= (1.0 - _TOUCHED_FORGETS) * (lacking.time - touch.since)
         mean, variance = free.expected(lacking, ahead)
-        weight = free.payload * self._weight_effect(lacking.bend_angles)
-        value = lacking.value - mean - weight
-        covariance = lacking.covariance + np.diag(variance)
-        covariance += _PAYLOAD_WRONG**2 * np.outer(weight, weight)
+        value, covariance = lacking.value - mean, lacking.covariance + np.diag(variance)
+        if free.payload:
+            weight = free.payload * self._weight_effect(lacking.bend_angles)
+            value -= weight
+            covariance += _PAYLOAD_WRONG**2 * np.outer(weight, weight)
         return replace(lacking, value=value, covariance=covariance), variance
 
     def _distance(self, away: Lacking, noise: Array) -> float:
