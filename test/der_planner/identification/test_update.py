@@ -94,6 +94,15 @@ def test_what_a_run_does_not_tell_stays():
     assert "stays" in said.text()
 
 
+def test_a_run_to_one_side_says_that_it_does_not_tell_the_other():
+    time, pressure = motion()
+    pressure[:, 0] = np.abs(pressure[:, 0])
+    today = another_day(RUBBING, (0.7, 0.7))
+    _, said = update(RUBBING, filmed(today, time, pressure))
+    assert [text for text in said.warnings if "one side only" in text] == [said.warnings[-1]]
+    assert said.warnings[-1].startswith("segment 0")
+
+
 def test_the_arcs_change_alike():
     arcs = tuple(replace(s, moment_gain=1.1 * s.moment_gain) for s in RUBBING.segments)
     today = another_day(RUBBING, (0.6, 1.4))

@@ -82,7 +82,7 @@ class Feedback:
 
     @property
     def warnings(self) -> list[Warned]:
-        """Every time that feedback was taken back, with its reason."""
+        """Every time that feedback was taken back or slowed, with its reason."""
         return self._supervisor.warnings
 
     @property
@@ -225,7 +225,8 @@ class Feedback:
         Those after the first are what would follow if nothing new were seen.
         """
         first, corrections = self._horizon.solution
-        corrections = self._reaction.mixed(self.share * corrections)
+        calmed = self._supervisor.calmed_ahead(self.share * corrections)
+        corrections = self._reaction.mixed(calmed)
         planned = self._nominal.commands[self._nominal.periods(first + np.arange(_SOON))]
         for ahead, each in enumerate(planned):
             corrections[ahead] = self._reaction.allowed(each + corrections[ahead]) - each

@@ -13,6 +13,7 @@ from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.signal import lfilter
 
 from der_planner.arrays import Array
 from der_planner.model import CONTROL_PERIOD
@@ -55,7 +56,7 @@ _LATE = 4.0
 
 @dataclass(frozen=True)
 class Warned:
-    """A reason for which feedback was taken back.
+    """A reason for which feedback was taken back or slowed.
 
     Attributes:
         time: [s] of the plan.
@@ -130,6 +131,16 @@ class Supervisor:
                 self.warnings.append(Warned(time, "swings", REASONS["swings"].format(np.ptp(far))))
                 break
         return correction
+
+    def calmed_ahead(self, corrections: Array) -> Array:
+        """Return what would be sent of coming corrections (W, M) [Pa], the first of them newest."""
+        if not self.swings:
+            return corrections
+        follows = CONTROL_PERIOD / _SLOW
+        ahead, _ = lfilter(
+            [follows], [1.0, follows - 1.0], corrections[1:], axis=0, zi=[(1 - follows) * self._slow]
+        )
+        return np.concatenate([self._slow[None], ahead])
 
     def held(self, time: float, pressure: float, possible: bool) -> None:
         """Look at what chambers are said to hold [Pa], and whether commands can have made it."""

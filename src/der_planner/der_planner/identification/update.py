@@ -53,6 +53,8 @@ WRONG_WAY = -0.5
 """Correlation of predicted and measured bend below which pressure and bend have other signs."""
 ONE_SIDED = 0.2
 """Share of the gain of one side that the other side has at least."""
+BOTH_SIDES = 0.2
+"""Share of the pressure to one side from which on the other side was driven, too."""
 LEAST_DURATION = 5.0
 """Least duration of all runs together [s]."""
 CALIBRATE_AGAIN = math.radians(3.0)
@@ -237,6 +239,13 @@ def update(limb: Limb, logs: CalibrationLog | Sequence[CalibrationLog]) -> tuple
             every.places, every.terms, known, values, deviation, strict=True
         )
     )
+    pressure = np.concatenate([run.pressure[run.usable] for run in runs])
+    warnings += [
+        f"segment {change.segment} was driven to one side only: that the gain of the other side "
+        "has changed alike is not told by these runs"
+        for change in changes
+        if change.term.name == "gain" and change.told and _one_sided(pressure[:, change.segment])
+    ]
     note = {
         "source": [log.source for log in given],
         "date": datetime.datetime.now(datetime.timezone.utc).date().isoformat(),
@@ -268,6 +277,12 @@ def _solve(every: DayTerms, runs: Sequence[Prepared]) -> tuple[Array, Array]:
         if not told.any():
             break
     return values, deviation
+
+
+def _one_sided(pressure: Array) -> bool:
+    """Return whether a pressure (K,) drives a segment to one side only."""
+    least, most = sorted((float(pressure.max()), -float(pressure.min())))
+    return least < BOTH_SIDES * most
 
 
 def _refuse_other_limbs(runs: Sequence[Prepared], remaining: Array) -> None:

@@ -119,7 +119,7 @@ class Corrector:
 
     Args:
         output: publishes revised setpoints and estimates.
-        warn: says that feedback was taken back.
+        warn: says why feedback was taken back or slowed.
         now: present ROS time [ns].
         vent: asks the driver to vent the limb, where a touch asks for it.
     """
@@ -271,7 +271,7 @@ class Corrector:
             feedback.late(index * GRID / NANOSECONDS, -left)
         each.coming = feedback.coming()
         for warned in feedback.warnings[each.warned :]:
-            text = f"plan {schedule.plan_id}, {warned.time:.2f} s: feedback is taken back, "
+            text = f"plan {schedule.plan_id}, {warned.time:.2f} s: feedback, "
             self._warn(f"{text}{warned.name}: {warned.message}")
         each.warned = len(feedback.warnings)
         self._react(each)
