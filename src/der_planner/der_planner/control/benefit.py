@@ -43,6 +43,9 @@ _OUTLYING = 9.0
 """An instant counts as much as one that leaves so many times the usual squared error, at most."""
 _LEAST_SLOW = 0.1
 """Added to how slow two motions are before they are compared."""
+_LEAVES = 0.25
+"""Share of a plan's largest bend, from where it begins, at which earlier runs count: a limb that
+has rested sticks as it does nowhere else, and a correction that grows meanwhile throws it."""
 _DOUBT = 0.001
 """√(P / 1 s), over the limb's length."""
 
@@ -68,7 +71,9 @@ class Benefit:
         self._held: dict[int, Array] = {}
         self._smooth = np.zeros((2, 2, 2))
         # Of −alone·wanted, wanted², alone² and 1 over time.
-        self._sums = np.zeros(4)
+        self._sums, self._earlier = np.zeros((2, 4))
+        away = np.abs(nominal.bend - nominal.bend[0]).max(axis=1)
+        self._leaves = int(np.argmax(away >= _LEAVES * away.max()))
         moved = nominal.bend - nominal.bend.mean(axis=0)
         rates = np.gradient(nominal.bend, CONTROL_PERIOD, axis=0)
         quick = float(np.sum(rates**2) / max(np.sum(moved**2), 1e-12)) / _QUICK**2
@@ -84,7 +89,7 @@ class Benefit:
 
         The quicker the motion, the less of that holds again.
         """
-        self._sums = self._slow * other._sums
+        self._earlier = self._slow * (other._sums + other._earlier)
 
     def take_over(self, other: Benefit) -> None:
         """Go on where the corrections of another plan of this limb were.
@@ -107,6 +112,8 @@ class Benefit:
             return
         passed = CONTROL_PERIOD * (k - self._seen if self._seen >= 0 else 1)
         self._seen, pressure = k, self._held[k]
+        if k >= self._leaves:
+            self._sums, self._earlier = self._sums + self._earlier, np.zeros(4)
         self._held = {j: held for j, held in self._held.items() if j > k}
         row = self._nominal.periods(k)
         jacobian = self._nominal.kinematics.tip_jacobians(self._nominal.bend[row])

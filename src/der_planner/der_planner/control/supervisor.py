@@ -13,7 +13,6 @@ from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import lfilter
 
 from der_planner.arrays import Array
 from der_planner.model import CONTROL_PERIOD
@@ -136,11 +135,10 @@ class Supervisor:
         """Return what would be sent of coming corrections (W, M) [Pa], the first of them newest."""
         if not self.swings:
             return corrections
-        follows = CONTROL_PERIOD / _SLOW
-        ahead, _ = lfilter(
-            [follows], [1.0, follows - 1.0], corrections[1:], axis=0, zi=[(1 - follows) * self._slow]
-        )
-        return np.concatenate([self._slow[None], ahead])
+        slow = [self._slow]
+        for each in corrections[1:]:
+            slow.append(slow[-1] + CONTROL_PERIOD / _SLOW * (each - slow[-1]))
+        return np.array(slow)
 
     def held(self, time: float, pressure: float, possible: bool) -> None:
         """Look at what chambers are said to hold [Pa], and whether commands can have made it."""
