@@ -28,7 +28,7 @@ _FREE_NOISE = 110.0, 2e-4
 """The same of e and noise together."""
 _FREE_GAIN, _FREE_COUPLING, _FREE_TIP = 0.1, 0.03, 1e-7
 """The same of γ by a segment's own pressure and by that of another, and of the tip [m/Pa]."""
-_FREE_STIFFNESS, _FREE_TIP_BENT = 0.25, 1e-3
+_FREE_STIFFNESS, _FREE_TIP_BENT = 0.15, 1e-3
 """The same of κ, over the segment's stiffness, and of the tip [m/rad]."""
 _FREE_FRICTION = 0.15
 """The same of φ, over the largest friction that the model knows."""
