@@ -40,7 +40,8 @@ _INCONSISTENT = 20.0
 _PATIENCE = 2.0
 """Time for which measurements may be inconsistent [s]."""
 _SLOW = 0.5
-"""Time in which corrections go to another level [s]."""
+"""Time in which corrections go to another level, and of each of two low-passes once they swing
+[s]."""
 _SWING = 0.02
 """Distance from that level beyond which it swings, as a share of the authority."""
 _TURNS = 3
@@ -89,7 +90,7 @@ class Supervisor:
         self._latched = False
         self._since: dict[str, float] = {}
         self._late = 0.0
-        self._slow = np.zeros(1)
+        self._slow = np.zeros((2, 1))
         self._fast: deque[Array] = deque(maxlen=round(_WINDOW / CONTROL_PERIOD))
 
     def advance(self, time: float, age: float, strange: float) -> float:
@@ -119,10 +120,10 @@ class Supervisor:
         Friction, loads and a wrong gain take corrections to another level. On a limb whose swing is
         not what the model says they go up and down, and drive it.
         """
-        self._fast.append(correction - self._slow)
-        self._slow = self._slow + CONTROL_PERIOD / _SLOW * self._fast[-1]
+        self._fast.append(correction - self._slow[0])
+        self._slow = _followed(self._slow, correction)
         if self.swings:
-            return self._slow
+            return self._slow[1]
         for series in np.array(self._fast).T:
             far = series[np.abs(series) > _SWING * self.authority]
             if np.count_nonzero(np.diff(np.sign(far))) >= _TURNS:
@@ -137,8 +138,8 @@ class Supervisor:
             return corrections
         slow = [self._slow]
         for each in corrections[1:]:
-            slow.append(slow[-1] + CONTROL_PERIOD / _SLOW * (each - slow[-1]))
-        return np.array(slow)
+            slow.append(_followed(slow[-1], each))
+        return np.array(slow)[:, 1]
 
     def held(self, time: float, pressure: float, possible: bool) -> None:
         """Look at what chambers are said to hold [Pa], and whether commands can have made it."""
@@ -172,3 +173,10 @@ class Supervisor:
         if self.reason != name:
             self.reason = name
             self.warnings.append(Warned(time, name, REASONS[name].format(number)))
+
+
+def _followed(slow: Array, correction: Array) -> Array:
+    """Return two low-passes, one after the other (2, M), a control period later."""
+    share = CONTROL_PERIOD / _SLOW
+    first = slow[0] + share * (correction - slow[0])
+    return np.stack([first, slow[1] + share * (first - slow[1])])
