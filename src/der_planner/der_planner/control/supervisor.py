@@ -122,8 +122,9 @@ class Supervisor:
         """
         self._fast.append(correction - self._slow[0])
         self._slow = _followed(self._slow, correction)
+        calm: Array = self._slow[1]
         if self.swings:
-            return self._slow[1]
+            return calm
         for series in np.array(self._fast).T:
             far = series[np.abs(series) > _SWING * self.authority]
             if np.count_nonzero(np.diff(np.sign(far))) >= _TURNS:
