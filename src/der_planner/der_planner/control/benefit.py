@@ -87,7 +87,8 @@ class Benefit:
     def remember(self, other: Benefit) -> None:
         """Begin with what corrections brought in an earlier run of this limb.
 
-        The quicker the motion, the less of that holds again.
+        It counts once the plan has left where it begins. The quicker the motion, the less of it
+        holds again.
         """
         self._earlier = self._slow * (other._sums + other._earlier)
 
