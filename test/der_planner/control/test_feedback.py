@@ -204,7 +204,10 @@ def test_another_motion_takes_over_without_a_jump(planned):
     assert np.mean(errors) < 0.025 * LENGTH
 
 
-def test_the_next_run_remembers_what_corrections_bring_once_it_has_left_its_rest(planned):
+@pytest.mark.parametrize(("gain", "more", "error"), [(1.0, 0.15, 0.9), (0.8, 0.0, 1.0)])
+def test_the_next_run_remembers_what_corrections_bring_once_it_has_left_its_rest(
+    planned, gain, more, error
+):
     feedback, errors, shares = Feedback(planned), [], np.zeros((2, len(planned.time) + 1))
     for run, share in enumerate(shares):
         if run:
@@ -214,12 +217,14 @@ def test_the_next_run_remembers_what_corrections_bring_once_it_has_left_its_rest
         def event(time: float, share=share, feedback=feedback) -> None:
             share[int(20 * time + 1e-6)] = feedback.share
 
-        errors.append(play(planned, Chain(), feedback, event=event).error.mean())
+        plant = Chain()
+        plant.chain.change_gain(gain)
+        errors.append(play(planned, plant, feedback, event=event).error.mean())
     moved = planned.reference.bend_angles - planned.reference.bend_angles[0]
     leaves = int(np.argmax(np.abs(moved).max(axis=1) > 0.1))
     np.testing.assert_array_equal(shares[1, :leaves], shares[0, :leaves])
-    assert shares[1, 100] > shares[0, 100] + 0.15
-    assert errors[1] < 0.9 * errors[0]
+    assert shares[1, 100] > shares[0, 100] + more
+    assert errors[1] < error * errors[0]
 
 
 def test_lost_tags_lead_back_to_the_plan(planned):

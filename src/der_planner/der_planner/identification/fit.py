@@ -8,7 +8,6 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from threadpoolctl import ThreadpoolController
 
 from der_planner.arrays import Array
 from der_planner.identification.air import AirFit, fit_air
@@ -48,7 +47,6 @@ from der_planner.limb import CalibratedRange, Limb
 from der_planner.model import ArcModel, Material, RodModel
 from der_planner.planning.loads import nearly_buckling
 
-_THREADS = ThreadpoolController()
 MOST_PASSES = 4
 """Largest number of times that lengths and bend angles are fitted in turn, for a limb that its
 weight bends unevenly."""
@@ -105,17 +103,14 @@ def fit(
         raise LogError(
             "a known weight tells the stiffness: leave dynamics among the terms, and the mass out"
         )
-    # Its matrices are too small for more threads, which would wait for each other.
-    with _THREADS.limit(limits=1, user_api="blas"):
-        found, report = _fit(limb, log, groups, longest_gap, weight)
-        late, deviation = report.delay
-        if abs(late) < max(SHORTEST_DELAY, 3.0 * deviation):
-            return found, report
-        # What was seen late would pass for damping and inertia.
-        earlier = log.seen_earlier(late, longest_gap)
-        found, report = _fit(limb, earlier, groups, longest_gap, weight)
-        delay = late + report.delay[0], report.delay[1]
-        return found, replace(report, delay=delay, taken_out=late)
+    found, report = _fit(limb, log, groups, longest_gap, weight)
+    late, deviation = report.delay
+    if abs(late) < max(SHORTEST_DELAY, 3.0 * deviation):
+        return found, report
+    # What was seen late would pass for damping and inertia.
+    earlier = log.seen_earlier(late, longest_gap)
+    found, report = _fit(limb, earlier, groups, longest_gap, weight)
+    return found, replace(report, delay=(late + report.delay[0], report.delay[1]), taken_out=late)
 
 
 def _fit(

@@ -15,8 +15,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
+from threadpoolctl import ThreadpoolController
 
 from der_planner.arrays import Array
+
+_THREADS = ThreadpoolController()
 
 Rows = tuple[Array, Array]
 """Weighted residuals (R,) and their derivatives by the unknowns (R, P)."""
@@ -114,18 +117,20 @@ class LeastSquares:
             return rows(x * unknowns.scale)[1]
 
         tolerance *= 1e-4 if self._cheap else 1.0
-        solution = least_squares(
-            residual,
-            begin / unknowns.scale,
-            jac=jacobian,
-            bounds=(unknowns.low / unknowns.scale, unknowns.high / unknowns.scale),
-            loss="soft_l1" if self._cheap and self._softness else "linear",
-            f_scale=self._softness or 1.0,
-            x_scale=1.0 if self._cheap else "jac",
-            xtol=10.0 * tolerance,
-            ftol=tolerance,
-            max_nfev=10 * MOST_EVALUATIONS if self._cheap else MOST_EVALUATIONS,
-        )
+        # The matrices are too small for more threads, which would wait for each other.
+        with _THREADS.limit(limits=1, user_api="blas"):
+            solution = least_squares(
+                residual,
+                begin / unknowns.scale,
+                jac=jacobian,
+                bounds=(unknowns.low / unknowns.scale, unknowns.high / unknowns.scale),
+                loss="soft_l1" if self._cheap and self._softness else "linear",
+                f_scale=self._softness or 1.0,
+                x_scale=1.0 if self._cheap else "jac",
+                xtol=10.0 * tolerance,
+                ftol=tolerance,
+                max_nfev=10 * MOST_EVALUATIONS if self._cheap else MOST_EVALUATIONS,
+            )
         return np.asarray(solution.x * unknowns.scale)
 
     def _all_rows(self, values: Array) -> Rows:
