@@ -11,7 +11,9 @@ friction is known, and its bend θ obeys
 with I the moment that the acceleration of everything beyond asks for, in the mean over its length,
 by measured angles and known masses. Friction is a sum of elements that turn round over different
 angles (z, Dahl), the first one at once. All that is unknown enters in proportion, also unequal
-chambers, stiffening, coupling and damping. Both sides are smoothed alike.
+chambers, stiffening, coupling and damping. Both sides are smoothed alike. What noise of the bend
+angles adds to the squares of I and θ is taken off: as inertia that no pressure moves, it would make
+the limb seem stiff.
 
 **A known weight**, hung on the resting limb for some seconds, needs no motion. A known force bends
 the resting limb by
@@ -45,11 +47,13 @@ from der_planner.limb.loads import GRAVITY
 from der_planner.model import CONTROL_PERIOD, ArcModel
 from der_planner.model.material import dahl
 
-SMOOTHED = 1.5
+SMOOTHED = 2.0
 """Standard deviation of the smoothing [rows]."""
+NOISES = 4
+"""Times that the noise of the bend angles is drawn."""
 BENDS_ON = np.deg2rad(6.0)
 """Rate of a bend from which on it counts [rad/s]: slower, a part of the segment may stick."""
-AWAY = 3
+AWAY = 4
 """Rows between those that count and those where the bend is slower, or turns round."""
 TURNS = (0.05, 0.2)
 """Bends over which elements of friction turn round, beside one that does so at once [rad]."""
@@ -107,9 +111,12 @@ def stiffness_in_motion(limb: Limb, log: Prepared) -> tuple[Array, Array]:
     apart = np.ones((2 * AWAY + 1, 1), dtype=bool)
     ways = [binary_erosion(way * rate > BENDS_ON, apart) for way in (1, -1)]
     counts = (ways[0] | ways[1]) & binary_erosion(log.usable, apart[:, 0])[:, None]
+    draw, noise = np.random.default_rng(0), _noise(log)
+    drawn = [_smooth(log.bend + noise * draw.normal(size=bend.shape)) for _ in range(NOISES)]
     change, deviation = np.zeros(limb.segment_count), np.full(limb.segment_count, np.inf)
     for _ in range(PASSES):
         inertia = _inertia(limb, bend, change)
+        added = np.array([[_inertia(limb, each, change) - inertia, each - bend] for each in drawn])
         for i, segment in enumerate(limb.segments):
             rows = counts[:, i]
             if rows.sum() < LEAST_ROWS:
@@ -119,28 +126,44 @@ def stiffness_in_motion(limb: Limb, log: Prepared) -> tuple[Array, Array]:
             bent = [angle, np.ones_like(angle), angle**3, angle * np.abs(own), np.abs(own)]
             beside = [pressure[:, j] for j in (i - 1, i + 1) if 0 <= j < limb.segment_count]
             columns = np.column_stack([inertia[:, i], *bent, *friction, *beside, rate])
-            (inert, elastic), error = _factors(columns[rows], own[rows])
+            (inert, elastic), error = _factors(columns[rows], added[:, :, rows, i], own[rows])
             if min(inert, elastic) > 0.0:
                 change[i] = np.log(segment.length * elastic / inert / segment.bending_stiffness)
                 deviation[i] = error / inert if error < SURE * inert else np.inf
     return change, deviation
 
 
-def _factors(columns: Array, values: Array) -> tuple[Array, float]:
+def _noise(log: Prepared) -> Array:
+    """Return the standard deviations (M,) of the noise of the bend angles [rad]."""
+    apart = np.abs(np.diff(log.bend[log.usable], 4, axis=0)) / np.sqrt(70.0)
+    deviation: Array = np.median(apart, axis=0) / 0.6745  # of a normal distribution
+    return deviation
+
+
+def _factors(columns: Array, added: Array, values: Array) -> tuple[Array, float]:
     """Return the first two of the factors that make columns (R, P) values (R,).
 
     The standard deviation is that of the first one, which is the less certain by far.
+
+    Args:
+        columns: as they were seen.
+        added: (N, 2, R) what noise, drawn N times, adds to the first two of them.
+        values: to make.
     """
     scale, weight = np.abs(columns).max(axis=0, initial=1e-30), np.ones(len(values))
     for _ in range(ROUNDS):
-        weighed = weight[:, None] * columns / scale
-        inverse = np.linalg.pinv(weighed.T @ weighed, hermitian=True)
+        weighed, noise = weight[:, None] * columns / scale, weight * added / scale[:2, None]
+        square = weighed.T @ weighed
+        true = square.copy()
+        true[:2, :2] -= np.einsum("nar,nbr->ab", noise, noise) / len(noise)
+        inverse = np.linalg.pinv(true, hermitian=True)
         factors = inverse @ (weighed.T @ (weight * values)) / scale
         left = values - columns @ factors
         weight = 1.0 / np.hypot(1.0, left / (OUTLYING * np.median(np.abs(left)) + 1e-30))
     # Smoothing makes what is left of so many rows alike.
     variance = 2.0 * np.sqrt(np.pi) * SMOOTHED * np.mean((weight * left) ** 2)
-    return factors[:2], float(np.sqrt(variance * inverse[0, 0]) / scale[0])
+    doubt = (inverse @ square @ inverse)[0, 0]
+    return factors[:2], float(np.sqrt(variance * doubt) / scale[0])
 
 
 def _inertia(limb: Limb, bend: Array, change: Array) -> Array:
