@@ -1,18 +1,20 @@
 """How much of feedback's corrections is worth sending: what they have brought, in hindsight.
 
-A share α of the corrections c that the horizon wants is sent, which has moved the tip by e_α; all
-of them would have moved it by e. The plan alone would have left the measured tip less r̄ less e_α,
-and the share that would have left least of it is
+A share α of the corrections c that the horizon wants is sent. It has moved the tip by e_α; all of
+them would have moved it by e. Without any, the tip less r̄ would have been the measured one less
+e_α, and the share that would have left least of it is
 
     α = − Σ (tip − r̄ − e_α)·e / (Σ e² + P)
 
-over what was seen until now, older instants counting less. As far as that may be chance, by what
-such a share would have left and the number of instants that are independent, it is taken off: α is
-less by some of its standard deviations, and within 0 … 1. e is that of a limb that follows its
-pressures without swinging, since statics are calibrated; what swings is smoothed away on both
-sides. Where a disturbance changes faster than it can be seen and made up for, or corrections bend
-the limb otherwise than the model, they come in the wrong phase, α falls, and the plan is left
-alone. Nothing is sent on trust: P keeps α at zero until something was seen.
+over what was seen until now, older instants counting less. This is an estimate: its standard
+deviation follows from what that share would have left, and from how many of the instants are
+independent. Some standard deviations are taken off, and α stays within 0 … 1. Nothing is sent on
+trust: P keeps α at zero until something was seen.
+
+e is that of a limb that follows its pressures without swinging, since statics are calibrated.
+Swings are smoothed away on both sides. Where a disturbance changes faster than it can be seen and
+made up for, or where corrections bend the limb otherwise than the model, they come in the wrong
+phase: α falls, and the plan is left alone.
 """
 
 from __future__ import annotations
@@ -31,7 +33,7 @@ _FORGET = 20.0
 """Time in which what corrections have brought is forgotten [s]."""
 _INDEPENDENT = 0.8
 """Time after which an instant says something new of the share [s]."""
-_DEVIATIONS, _DEVIATIONS_QUICK = 2.0, 1.5
+_DEVIATIONS, _DEVIATIONS_QUICK = 2.0, 3.0
 """Number of its standard deviations that are taken off the share, and how many more in a quick
 motion: there what a correction brings differs most from one second to the next."""
 _RISES, _RISES_QUICK = 1.5, 3.0
