@@ -330,6 +330,18 @@ def test_a_wrong_shape_is_refused(planned):
         feedback.pressures(0.0, [0.0])
 
 
+@pytest.mark.parametrize("time", [1.7e9, np.nan])
+def test_times_of_another_clock_are_refused(planned, time):
+    feedback, zero = Feedback(planned), np.zeros(2)
+    for tell in (
+        lambda: feedback.pressures(time, zero),
+        lambda: feedback.measure(time, zero, zero),
+        lambda: feedback.command(time),
+    ):
+        with pytest.raises(ValueError, match="seconds since its first setpoint"):
+            tell()
+
+
 def test_pressures_in_another_unit_end_feedback(planned):
     feedback = Feedback(planned)
     for time in 0.05 * np.arange(160):

@@ -109,6 +109,13 @@ def test_a_limb_that_is_known_from_an_earlier_run_feels_more_though_it_rests_oth
     assert felt == [False, True]
 
 
+def test_doubt_ends_no_touch(model):
+    sense, hit = TouchSense(model, calibrated()), lacking(model, {20: (0.0, 0.2)})
+    swings = replace(hit, time=1.1, covariance=1e4 * hit.covariance)
+    over = replace(hit, time=1.2, value=np.zeros(4))
+    assert [sense.look(each).touched for each in (hit, swings, over)] == [True, True, False]
+
+
 def test_a_touch_ends_and_the_next_one_has_a_time_of_its_own(model):
     sense, hit = TouchSense(model, calibrated()), lacking(model, {20: (0.0, 0.2)})
     nothing = replace(hit, value=np.zeros(4))

@@ -221,6 +221,10 @@ def _check(given: argparse.Namespace) -> None:
             given.play and not (given.graph or given.offline),
             "--play goes with --graph or --offline",
         ),
+        (
+            given.weight is not None and given.offline,
+            "--weight goes with --graph or --csv: nobody hangs a weight on the offline twin",
+        ),
         (not 0 <= given.seed < 2**31, f"--seed is {given.seed}: choose 0 to {2**31 - 1}"),
         (
             given.mass is not None and given.fit_mass,

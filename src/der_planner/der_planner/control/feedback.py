@@ -38,6 +38,8 @@ _AUTHORITY = 0.4
 """Largest correction, as a share of the limb's pressure limit."""
 _SOON = 10
 """Coming commands that may be played before the next ones are known, and must keep off a touch."""
+_LONGEST = 1e5
+"""Instants further from the first setpoint are of another clock, or in another unit [s]."""
 _FILLED = 0.1
 """Command from which on chambers must hold something, as a share of the limb's pressure limit."""
 
@@ -138,8 +140,9 @@ class Feedback:
         """Take in the chambers' differential pressures (M,) [Pa], as measured at an instant [s].
 
         Raises:
-            ValueError: another shape.
+            ValueError: another shape, or no time of the plan.
         """
+        _check(time)
         values, limb = np.asarray(differential, dtype=float), self.plan.limb
         beyond = bool(impossible(limb, "pressures", values))
         changed = self._chambers.read(time, np.full_like(values, np.nan) if beyond else values)
@@ -166,8 +169,9 @@ class Feedback:
             covariance: of the tip (2, 2) [m²], or of bend angles and tip (M + 2, M + 2).
 
         Raises:
-            ValueError: another shape.
+            ValueError: another shape, or no time of the plan.
         """
+        _check(time)
         self._estimator.measure(time, bend_angle, tip, covariance)
 
     def command(self, time: float) -> Array:
@@ -175,7 +179,11 @@ class Feedback:
 
         It keeps the limb's pressure and slew limits. To be asked for ahead of the instant, in
         order; asked for again, it is computed again.
+
+        Raises:
+            ValueError: no time of the plan.
         """
+        _check(time)
         k = round(time / CONTROL_PERIOD)
         instant = k * CONTROL_PERIOD
         supervisor = self._supervisor
@@ -246,3 +254,10 @@ class Feedback:
         """Return the estimate of the limb at an instant [s], past or to come."""
         with _THREADS.limit(limits=1, user_api="blas"):
             return self._estimator.estimate(time)
+
+
+def _check(time: float) -> None:
+    if not abs(time) < _LONGEST:
+        raise ValueError(
+            f"the instant {time:.6g} is none of the plan: give seconds since its first setpoint"
+        )

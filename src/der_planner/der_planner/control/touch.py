@@ -160,6 +160,7 @@ class TouchSense:
         self._lately: deque[Lacking] = deque()
         self._weighed: list[tuple[float, float, bool]] = []
         self._came_at_once = False
+        self._noticed, self._surer = np.zeros((2, model.inputs + 2, model.inputs + 2))
         self._learned = self._calm = -np.inf
         self._earlier: list[tuple[FreeLevel, float]] = []
 
@@ -195,6 +196,7 @@ class TouchSense:
     def look(self, lacking: Lacking) -> Touch:
         """Return what a newer instant says of a touch."""
         before = self.newest
+        self._surer = self._noticed - lacking.covariance
         self._lately.append(lacking)
         while self._lately[0].time < lacking.time - _AT_ONCE:
             self._lately.popleft()
@@ -212,6 +214,8 @@ class TouchSense:
         if lacking.time - self._calm > _LEARNED_AFTER:
             self._recent.clear()
         since = before.since if before.touched else lacking.time
+        if touched and not before.touched:
+            self._noticed = lacking.covariance
         told = weighed = False
         if touched and self._has_weight:
             told, weighed = self._weighs(away, lacking.time - since)
@@ -252,10 +256,13 @@ class TouchSense:
     def _distance(self, away: Lacking, noise: Array) -> float:
         """Return the squared distance from the free level, over that of a touch.
 
-        What friction may hide of a touch that goes on does not end it.
+        What friction may hide of a touch that goes on does not end it. Nor does doubt that a swing
+        brings after it was noticed.
         """
-        left = away.value if self.newest.touched else away.beside_friction
-        return float(left @ np.linalg.solve(noise, left)) / self.threshold
+        touched = self.newest.touched
+        left = away.value if touched else away.beside_friction
+        doubts = [noise, noise + self._surer] if touched else [noise]
+        return float(max(left @ np.linalg.solve(each, left) for each in doubts)) / self.threshold
 
     def _lets_go(self, lacking: Lacking, variance: Array) -> bool:
         """Return whether what seems to touch is the end of something; go back to its free level.
