@@ -160,7 +160,7 @@ class TouchSense:
         self._lately: deque[Lacking] = deque()
         self._weighed: list[tuple[float, float, bool]] = []
         self._came_at_once = False
-        self._noticed, self._surer = np.zeros((2, model.inputs + 2, model.inputs + 2))
+        self._noticed = np.zeros((model.inputs + 2, model.inputs + 2))
         self._learned = self._calm = -np.inf
         self._earlier: list[tuple[FreeLevel, float]] = []
 
@@ -196,7 +196,6 @@ class TouchSense:
     def look(self, lacking: Lacking) -> Touch:
         """Return what a newer instant says of a touch."""
         before = self.newest
-        self._surer = self._noticed - lacking.covariance
         self._lately.append(lacking)
         while self._lately[0].time < lacking.time - _AT_ONCE:
             self._lately.popleft()
@@ -259,9 +258,10 @@ class TouchSense:
         What friction may hide of a touch that goes on does not end it. Nor does doubt that a swing
         brings after it was noticed.
         """
-        touched = self.newest.touched
-        left = away.value if touched else away.beside_friction
-        doubts = [noise, noise + self._surer] if touched else [noise]
+        left, doubts = away.beside_friction, [noise]
+        if self.newest.touched:
+            left = away.value
+            doubts.append(noise + self._noticed - self._lately[-1].covariance)
         return float(max(left @ np.linalg.solve(each, left) for each in doubts)) / self.threshold
 
     def _lets_go(self, lacking: Lacking, variance: Array) -> bool:
