@@ -337,6 +337,9 @@ def test_times_of_another_clock_are_refused(planned, time):
         lambda: feedback.pressures(time, zero),
         lambda: feedback.measure(time, zero, zero),
         lambda: feedback.command(time),
+        lambda: feedback.sent(time, zero),
+        lambda: feedback.estimate(time),
+        lambda: feedback.late(time, 0.1),
     ):
         with pytest.raises(ValueError, match="seconds since its first setpoint"):
             tell()

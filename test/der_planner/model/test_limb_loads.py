@@ -66,6 +66,8 @@ def test_a_limb_weighs_what_the_scale_says_with_its_fittings():
     for wrong in (0.045, 0.0, -0.3, float("nan"), float("inf")):
         with pytest.raises(LimbError, match=r"more than the 0\.045 kg of its masses"):
             limb.weighing(wrong)
+    with pytest.raises(LimbError, match="times what the limb file says"):
+        limb.weighing(360.0)
 
 
 def test_what_sits_on_the_stiff_base_weighs_and_moves_nothing():

@@ -178,6 +178,8 @@ def test_wrong_input_is_named():
         simulate(LIMB, TIME, commands=np.where(TIME[:, None] == TIME[1], np.nan, COMMANDS))
     with pytest.raises(ValueError, match="evenly spaced"):
         simulate(LIMB, TIME**2, commands=COMMANDS)
+    with pytest.raises(ValueError, match="give rising seconds"):
+        simulate(LIMB, 1000.0 * TIME, commands=COMMANDS)
 
 
 @pytest.mark.parametrize("model", ["der", "pcc"])

@@ -103,3 +103,18 @@ def test_a_file_says_what_is_wrong_with_it(tmp_path):
         file.write_text(text)
         with pytest.raises(PlanningError, match=said):
             Obstacles.from_yaml(file)
+
+
+@pytest.mark.parametrize(
+    ("way", "said"),
+    [
+        (circle((120.0, 100.0), 10.0), "in metres"),
+        (circle((0.12, 0.1), 10.0), "in metres"),
+        (circle((0.12, 0.0)), "cm from its clamp"),
+        (edge(-0.08, -1.0), "a normal that points"),
+        (dataclasses.replace(edge(-0.08, 1.0), limb_radius=15.0), "limb_radius_m"),
+    ],
+)
+def test_numbers_that_no_rig_has_are_refused(way, said):
+    with pytest.raises(PlanningError, match=said):
+        plan(LIMB, MOTION, obstacles=way)

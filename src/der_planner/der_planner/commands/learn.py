@@ -21,7 +21,7 @@ import numpy as np
 from der_planner.control import Learner, LearningError
 from der_planner.experiment.console import check_file, command_parser, run_command
 from der_planner.limb import Limb, LimbError
-from der_planner.planning import Motion, Plan, PlanningError, plan
+from der_planner.planning import Motion, Obstacles, Plan, PlanningError, plan
 from der_planner.planning.motions import NAMES
 from der_planner.planning.plan_file import read_plan, write_plan
 from der_planner.results import BagError, EvaluationError, RunSeries, load_run
@@ -102,10 +102,13 @@ def learning_summary(learner: Learner) -> dict[str, Any]:
 
 
 def add_plan_options(parser: argparse.ArgumentParser, needed: bool = True) -> None:
-    """Add --limb or --plan, of which one may be needed."""
+    """Add --limb or --plan, of which one may be needed, and --obstacles."""
     base = parser.add_mutually_exclusive_group(required=needed)
     base.add_argument("--limb", type=Path, metavar="FILE", help="limb file of the plan in the bag")
     base.add_argument("--plan", type=Path, metavar="FILE", help="learned plan that was played")
+    parser.add_argument(
+        "--obstacles", type=Path, metavar="FILE", help="obstacles of the plan in the bag, if any"
+    )
 
 
 def plan_of(run: RunSeries, given: argparse.Namespace) -> Plan:
@@ -127,7 +130,8 @@ def plan_of(run: RunSeries, given: argparse.Namespace) -> Plan:
             "--plan FILE (run_experiment.py --learn keeps plans in its folder learned)"
         )
     motion = Motion.named(told.motion, told.amplitude, told.period, told.cycles)
-    return plan(limb, motion, model=told.model)
+    in_the_way = Obstacles.from_yaml(given.obstacles) if given.obstacles else None
+    return plan(limb, motion, model=told.model, obstacles=in_the_way)
 
 
 def check_same(planned: Plan, run: RunSeries) -> None:
@@ -144,5 +148,5 @@ def check_same(planned: Plan, run: RunSeries) -> None:
         raise LearningError(
             f"{run.description.title} holds another motion than the plan ({len(asked)} and "
             f"{len(wanted)} setpoints, references up to {apart * 100:.1f} cm apart): give bags of "
-            "one motion and the limb file it was planned with"
+            "one motion, and the limb file and the --obstacles that it was planned with"
         )

@@ -36,6 +36,8 @@ _BEHIND_DISTANCE = 0.02
 """Distance of the reference from the start from which a limb can be said to stay behind [m]."""
 _BEHIND_TIME = 1.0
 """Time for which a limb must stay behind [s]."""
+_NOT_THESE = 0.5
+"""Error of the chambers, over what they hold, from which on they are not those of the run."""
 _USUAL_ERROR = 1.5
 """Multiple of the median error up to which a limb still followed."""
 _LEAST_CORRELATION = 0.5
@@ -280,7 +282,7 @@ def chambers_beyond(
         None where no reading was whole.
 
     Raises:
-        LearningError: shapes that do not fit.
+        LearningError: shapes that do not fit, or pressures that are not those of the run.
     """
     instants, values = np.asarray(time, dtype=float), np.asarray(measured, dtype=float)
     wanted = (len(instants), expected.shape[1])
@@ -295,4 +297,12 @@ def chambers_beyond(
     order = np.argsort(instants[whole], kind="stable")
     instants, values = instants[whole][order], values[whole][order]
     middle = setpoints + 0.5 * (setpoints[1] - setpoints[0])
-    return interpolate(middle, instants, values) - expected
+    beyond = interpolate(middle, instants, values) - expected
+    missed, usual = (float(np.sqrt(np.mean(each**2))) for each in (beyond, expected))
+    if missed > _NOT_THESE * usual:
+        raise LearningError(
+            f"the chambers are {missed:.0f} Pa away from the {usual:.0f} Pa that the commands make "
+            "of them, root mean square: give Pa, segment by segment from the clamp, or look for a "
+            "chamber that leaks"
+        )
+    return beyond

@@ -242,16 +242,19 @@ class Feedback:
 
     def sent(self, time: float, command: ArrayLike) -> None:
         """Tell that another command (M,) [Pa] was sent for an instant [s] than was asked for."""
+        _check(time)
         k = round(time / CONTROL_PERIOD)
         self._chambers.send(k, np.asarray(command, dtype=float))
         self._estimator.changed(k * CONTROL_PERIOD)
 
     def late(self, time: float, by: float) -> None:
         """Tell that the command of an instant [s] could not be sent in time, and how late [s]."""
+        _check(time)
         self._supervisor.late(time, by)
 
     def estimate(self, time: float) -> Estimate:
         """Return the estimate of the limb at an instant [s], past or to come."""
+        _check(time)
         with _THREADS.limit(limits=1, user_api="blas"):
             return self._estimator.estimate(time)
 

@@ -19,7 +19,8 @@ from der_planner.model import CONTROL_PERIOD
 
 REASONS = {
     "tags lost": "the limb has not been seen for {:.1f} s",
-    "inconsistent": "the limb moves as the model cannot, measurements are {:.0f} times too far off",
+    "inconsistent": "the limb moves as the model cannot, measurements are {:.0f} times too far "
+    "off: is it this limb, and are they in rad, m and Pa, segment by segment from the clamp",
     "swings": "corrections swing by {:.0f} Pa, what is slow in them is sent from now on: does the "
     "limb swing as its file says? Calibrate it again",
     "late": "commands come {:.2f} s after their instant",

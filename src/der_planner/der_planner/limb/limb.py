@@ -184,7 +184,8 @@ class Limb:
             mass: from the clamp on, fittings, tubes and tags included, without a payload [kg].
 
         Raises:
-            LimbError: it is not a number, or the limb's `masses` alone are as heavy.
+            LimbError: it is not a number, far from what the file says, or the limb's `masses` alone
+                are as heavy.
         """
         fittings = sum(item.mass for item in self.masses)
         if not math.isfinite(mass) or mass <= fittings:
@@ -193,6 +194,11 @@ class Limb:
                 "of its masses, which are part of it"
             )
         factor = (mass - fittings) / self._own_mass
+        if factor > MOST_CARRIED:
+            raise LimbError(
+                f"{mass:g} kg are {factor:.0f} times what the limb file says, {self.mass:.3g} kg: "
+                "give kg"
+            )
 
         def scaled(segments: tuple[Segment, ...]) -> tuple[Segment, ...]:
             return tuple(

@@ -195,18 +195,14 @@ class Material:
 
     # Along the bend at rest --------------------------------------------------------------------
 
-    def slow_effective_pressure(self, time: ArrayLike, differential: ArrayLike) -> Array:
-        """Return effective pressures (K, M) [Pa] of chamber pressures (K, M) [Pa] alone.
-
-        Friction and creep act along the bend of `resting_bend`.
-        """
-        times, pressures = np.asarray(time, dtype=float), np.asarray(differential, dtype=float)
-        return self.slow(times, pressures)[0]
-
     def slow(
         self, time: Array, differential: Array, start: Memory | None = None
     ) -> tuple[Array, Memory]:
-        """Return the same, and what friction and creep remember at the end."""
+        """Return effective pressures (K, M) [Pa] of chamber pressures (K, M) [Pa] alone.
+
+        Friction and creep act along the bend of `resting_bend`. What they remember at the end is
+        returned, too.
+        """
         history = self.remember(time, self.resting_bend(time, differential, start), start)
         return self.without_memory(differential, self.pressure_taken(history)), history.at(-1)
 

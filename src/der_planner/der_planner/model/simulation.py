@@ -28,6 +28,8 @@ CONTROL_PERIOD = 0.05
 """A command is held for this long [s]: setpoints are 50 ms apart."""
 STEPS = 5
 """Integrator steps in a control period: 10 ms."""
+_LONGEST_PERIOD = 1.0
+"""Of instants that are told in seconds [s]."""
 _ARC_STEP = 0.01
 """Integrator step of the arcs under measured pressures [s]."""
 
@@ -194,9 +196,12 @@ def _check(
         )
     if not np.isfinite(given).all():
         row = int(np.flatnonzero(~np.isfinite(given).all(axis=1))[0])
-        raise ValueError(f"pressures must be finite [Pa], got {given[row]} in row {row}")
+        name = "pressures" if commands is None else "commands"
+        raise ValueError(f"{name} must be finite [Pa], got {given[row]} in row {row}")
     if not np.allclose(np.diff(time), time[1] - time[0], rtol=1e-6, atol=1e-9):
         raise ValueError("the instants must be evenly spaced: resample the series first")
+    if not 0.0 < time[1] - time[0] <= _LONGEST_PERIOD:
+        raise ValueError(f"the instants are {time[1] - time[0]:g} s apart: give rising seconds")
     return given
 
 

@@ -43,6 +43,8 @@ _SMOOTHED = 4.0
 """Standard deviation, in poses, by which the way past is smoothed: it would begin with a kink."""
 _NEARNESS = 1e-3
 """Tip error that a unit change of a bend angle is worth there [m/rad]."""
+_FAR = 10.0
+"""Distance from the clamp, over the limb's length, beyond which a number is not in metres."""
 
 
 @dataclass(frozen=True)
@@ -153,7 +155,8 @@ class Obstacles:
             ValueError: a key is unknown or missing, or a number is not one that can be.
         """
         if not isinstance(content, Mapping) or set(content) != {"limb_radius_m", "obstacles"}:
-            raise ValueError("expected limb_radius_m and obstacles, and nothing else")
+            found = ", ".join(map(str, content)) if isinstance(content, Mapping) else content
+            raise ValueError(f"the two keys limb_radius_m and obstacles are expected, got {found}")
         items = tuple(_obstacle(item) for item in content["obstacles"])
         return Obstacles(_number(content["limb_radius_m"], "limb_radius_m"), items)
 
@@ -183,6 +186,36 @@ class Obstacles:
         along = np.linalg.norm(np.diff(points[k], axis=0), axis=1)[:p].sum()
         clearance = float(distance[k, p]) - self.limb_radius
         return Nearest(clearance, int(k), float(along + points[k, 0, 0]), out[k, p])
+
+    def check_rest(self, model: RodModel, curve: Array, bend: Array) -> None:
+        """Refuse numbers in another unit, and obstacles where the limb rests.
+
+        Args:
+            model: rod of the limb.
+            curve: (P, 2) its centreline at rest [m].
+            bend: (M,) of it [rad].
+
+        Raises:
+            PlanningError: names what cannot be, and the remedy.
+        """
+        length = model.limb.length
+        sizes = {"limb_radius_m": self.limb_radius / length}
+        for each in self.items:
+            sizes[str(each)] = abs(float(each.away(np.zeros(2))[0])) / (_FAR * length)
+        for name, size in sizes.items():
+            if size > 1.0:
+                raise PlanningError(
+                    f"{name} in the file of obstacles is far too large for a limb of {length:.3g} "
+                    "m: give all lengths in metres"
+                )
+        try:
+            self.check(model, np.zeros(1), curve[None], bend[None])
+        except ObstacleError as error:
+            raise PlanningError(
+                f"the resting limb is {-error.clearance * 1000:.1f} mm inside {error.obstacle}, "
+                f"{error.place * 100:.1f} cm from its clamp: give its place in metres from the "
+                "clamp, limb_radius_m as it is, and a normal that points to the limb's side"
+            ) from error
 
     def check(self, model: RodModel, time: Array, curves: Array, bend_angles: Array) -> None:
         """Refuse a motion that would touch an obstacle with more force than that allows.
@@ -277,10 +310,10 @@ def _obstacle(item: Any) -> Obstacle:
     """
     keys = set(item) if isinstance(item, Mapping) else set()
     allowed = _number(item.get("allowed_force_n", 0.0), "allowed_force_n") if keys else 0.0
-    if "circle_m" in keys and keys <= _CIRCLE:
+    if {"circle_m", "radius_m"} <= keys <= _CIRCLE:
         radius = _number(item["radius_m"], "radius_m")
         return Obstacle(_pair(item["circle_m"], "circle_m"), radius, np.zeros(2), allowed)
-    if "half_plane_m" in keys and keys <= _HALF_PLANE:
+    if {"half_plane_m", "normal"} <= keys <= _HALF_PLANE:
         normal = _pair(item["normal"], "normal")
         size = float(np.linalg.norm(normal))
         if size == 0.0:

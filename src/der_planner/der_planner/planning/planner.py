@@ -194,15 +194,23 @@ def _past(
 
     Raises:
         ObstacleError: the limb would run into an obstacle all the same.
+        PlanningError: an obstacle is where the limb rests, or leaves no way past that it can take.
     """
     path, led, time = reference.tip, "", reference.time
+    obstacles.check_rest(rod, configuration.curves(time[:1])[0], configuration.bend_at(time[:1])[0])
     for more in range(rounds, -1, -1):
         curves, bend = configuration.curves(time), configuration.bend_at(time)
         aside = obstacles.led_past(rod, curves, bend) if more else np.zeros_like(path)
         if not aside.any():
             break
         reference = replace(reference, tip=reference.tip + aside)
-        configuration = configure(configuration.model, reference)
+        try:
+            configuration = configure(configuration.model, reference)
+        except PlanningError as error:
+            raise PlanningError(
+                f"the way past what is in the way cannot be taken: {error}; shrink or move the "
+                "motion, or give the obstacles as they are"
+            ) from error
         off = np.linalg.norm(reference.tip - path, axis=1)
         led = (
             f"what is in the way leads the tip up to {off.max() * 1000:.1f} mm off its path, at "
