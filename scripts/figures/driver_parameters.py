@@ -5,6 +5,7 @@ python3 scripts/write_driver_parameters.py
 
 from __future__ import annotations
 
+import argparse
 from typing import Any
 
 from pressure_driver.settings import NODES, declarations
@@ -35,6 +36,7 @@ def _written(value: Any) -> str:
 
 def main() -> int:
     """Write the files of the package."""
+    argparse.ArgumentParser(description=__doc__).parse_args()
     for node in NODES:
         (PACKAGE / "config" / f"{node}.yaml").write_text(parameter_file(node), encoding="utf-8")
     return 0
