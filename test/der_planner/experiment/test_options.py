@@ -27,6 +27,7 @@ from der_planner.limb import Limb, PointMass
         (["--library", "/nowhere"], "/nowhere is no folder"),
         (["--poses", "--offline"], "--poses is motion capture of the twin"),
         (["--board", "arduino"], "unknown board 'arduino'"),
+        (["--reaction", "push"], "unknown reaction .push."),
         (["--board", "festo", "--offline"], "--board is about the twin.s nodes"),
     ],
 )

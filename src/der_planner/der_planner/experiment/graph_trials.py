@@ -115,6 +115,8 @@ def _planner_parameters(run: TrialRun) -> dict[str, Any]:
         "payload": options.loads.payload,
         "payload_at": options.loads.payload_at or 0.0,
         "feedback": trial.feedback,
+        "reaction": options.reaction,
+        "force_limit": options.force_limit,
         "obstacles": str(options.obstacles or ""),
     }
     if run.learned is not None:

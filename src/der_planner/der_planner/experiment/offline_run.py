@@ -80,7 +80,8 @@ def _play(planned: Plan, run: TrialRun) -> tuple[Played, dict[str, Any]]:
     if (obstacles := run.options.in_the_way) is not None:
         plant.twin.put_pegs(obstacles.circles)
     plant.rest(_AT_REST)
-    feedback = Feedback(planned) if trial.feedback else None
+    reaction, limit = run.options.reaction, run.options.force_limit or None
+    feedback = Feedback(planned, reaction, limit) if trial.feedback else None
     played = lockstep.play(planned, plant, feedback, lockstep.Sensors(seed=trial.seed))
     if feedback is None:
         return played, {}

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from der_planner.control.reaction import KINDS, Kind
 from der_planner.experiment.console import Loads, OptionError, add_load_options
 from der_planner.experiment.processes import Hardware
 from der_planner.limb import Limb
@@ -157,6 +158,15 @@ class Options:
     feedback: bool = _option(
         False, "play every plan of the rod twice: open loop, and corrected while it moves"
     )
+    reaction: Kind = _option(
+        "yield",
+        f"of feedback to what touches the limb: {', '.join(KINDS)}; `yield` presses no harder than "
+        "the plan",
+        metavar="REACTION",
+    )
+    force_limit: float = _option(
+        0.0, "force [N] that `yield` allows, in place of the plan's; 0: the plan's", (0.0, 100.0)
+    )
     page: int | None = _option(
         None,
         f"serve the operator's page from the first second until Ctrl-C after the last run, at port "
@@ -300,6 +310,7 @@ def parse(arguments: Sequence[str]) -> Options:
     _check_names("model", models, MODELS)
     _check_names("method", (given.method,), METHODS)
     _check_names("board", (given.board,), BOARDS)
+    _check_names("reaction", (given.reaction,), KINDS)
     hardware = Hardware.from_yaml(given.hardware) if given.hardware else None
     limb = given.limb or (Path(hardware.limb) if hardware and hardware.limb else None)
     real = hardware is not None and hardware.twin is None
