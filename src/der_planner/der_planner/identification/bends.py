@@ -490,7 +490,10 @@ def _apart(table: Array) -> tuple[Array, Array]:
 
 def _rubs_along(material: Material, log: Prepared) -> Array:
     """Return the bend angles (K, M) along which friction and creep act in a log, see the module."""
-    slow, _ = _apart(material.resting_bend(log.log.time, log.pressure))
+    rest = material.resting_bend(log.log.time, log.pressure)
+    if not log.swings:
+        return rest
+    slow, _ = _apart(rest)
     _, swing = _apart(gaussian_filter1d(log.bend, SWING_SMOOTHED, axis=0, mode="nearest"))
     return slow + swing
 

@@ -160,6 +160,7 @@ class Prepared:
         bend: (K, M) bend angles without gaps [rad].
         usable: (K,) rows to fit to.
         warnings: sentences for the report.
+        swings: whether friction is loosened by the measured swings, or as in a prediction by none.
     """
 
     log: CalibrationLog
@@ -167,6 +168,7 @@ class Prepared:
     bend: Array
     usable: NDArray[np.bool_]
     warnings: tuple[str, ...]
+    swings: bool = True
 
     def without(self, rows: NDArray[np.bool_]) -> Prepared:
         """Return the log with rows (K,) more that are not fitted to."""
@@ -233,7 +235,7 @@ def prepare(
             f"{CONTROL_PERIOD * swinging.sum():.1f} s are not used, since no pressure tells that "
             "motion"
         )
-    return Prepared(grid, pressure, bend, valid & ~swinging, tuple(warnings))
+    return Prepared(grid, pressure, bend, valid & ~swinging, tuple(warnings), swings=to_fit)
 
 
 def _still_swinging(time: Array, pressure: Array, bend: Array, limb: Limb) -> NDArray[np.bool_]:
