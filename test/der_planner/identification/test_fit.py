@@ -20,7 +20,7 @@ from der_planner.identification.excitation import calibration_run, steps, sweep,
 from der_planner.identification.lengths import fit_geometry, lengths_of, with_lengths
 from der_planner.identification.log import Prepared
 from der_planner.limb import Limb
-from der_planner.model import RodModel
+from der_planner.model import Material, RodModel
 
 pytestmark = pytest.mark.slow
 
@@ -108,6 +108,29 @@ def test_derivatives_agree_with_differences(log):
         assert np.abs(exact[:, :, place] - difference).max() < tolerance * scale, term.name
 
 
+def test_a_swing_lets_go_of_friction_while_a_segment_waits():
+    limb = with_segments(
+        Limb.default(),
+        friction_moment=lambda s: 800.0 * s.moment_gain,
+        friction_curvature=lambda s: 0.12 / s.length,
+    )
+    model, time = RodModel(limb, NODES), 0.05 * np.arange(300)
+    pressure = np.outer(np.clip(time / 3.0, 0.0, 1.0), [9000.0, -9000.0])
+    bend = Material(limb).resting_bend(time, pressure)
+    log = CalibrationLog(time, pressure, pressure, bend, np.full((300, 2), np.nan))
+    swing = 0.06 * np.sin(9.0 * time) * np.exp(-((time - 9.0) ** 2) / 4.0)
+    still = Prepared(log, pressure, bend, np.ones(300, bool), ())
+    shaken = replace(still, bend=bend + swing[:, None])
+    stays, freed, unmoved = (
+        follow(model, each).bend_angles[-1]
+        for each in (still, shaken, replace(shaken, swings=False))
+    )
+    np.testing.assert_allclose(unmoved, stays, atol=2e-3)
+    held = 800.0 * limb.static_gain
+    assert np.all(np.abs(freed - stays) > 0.6 * held)
+    assert np.all(np.abs(freed - stays) < 1.1 * held)
+
+
 def test_known_parameters_are_recovered_within_their_uncertainty(fitted):
     _, report = fitted
     truth = values_of(hidden_limb())
@@ -117,7 +140,7 @@ def test_known_parameters_are_recovered_within_their_uncertainty(fitted):
             true = truth[segment, COLUMN[name]]
             spread = max(item.deviation, 1e-3 * abs(true))
             assert abs(item.value - true) < 4 * spread, (name, item, true)
-    assert np.degrees(report.residual).max() < 0.3
+    assert np.degrees(report.residual).max() < 0.4
     assert report.value("gain[0]").deviation < 0.03 * report.value("gain[0]").value
 
 
@@ -210,11 +233,11 @@ def test_what_is_seen_late_is_told_and_taken_out_of_the_fit(fitted):
 
 def test_a_number_at_the_end_of_its_range_names_what_would_tell_it():
     sticking = with_segments(
-        DAMPED,
+        Limb.default(),
         friction_moment=lambda s: 800.0 * s.moment_gain,
         friction_curvature=lambda s: 0.003 / s.length,
     )
-    _, report = fit(DAMPED, synthetic_log(sticking), terms=("friction", "dynamics"))
+    _, report = fit(Limb.default(), synthetic_log(sticking), terms=("friction", "dynamics"))
     said = [warning for warning in report.warnings if "at the end of its range" in warning]
     assert any("friction_angle[0]" in warning for warning in said)
     assert all("slow strokes of a few degrees" in w for w in said if "friction" in w)

@@ -4,9 +4,8 @@ The unknowns of a calibration are parameters of segments in units that angles an
 
 Friction and creep act along the bend at rest that the pressures give, as when the limb is predicted
 afterwards; along the measured bend, an error of friction would partly cancel itself in the
-residual. Only the swing about it is the measured one: a limb that swings lets go of what friction
-held, and resists the swing by it. Without that, what friction lets go would pass for creep, and
-what it resists for stiffness.
+residual. Only while a segment waits for pressures to change does the measured swing count: it lets
+go of what friction held, which would pass for creep and for a spring that softens.
 """
 
 from __future__ import annotations
@@ -60,11 +59,19 @@ ANGLE_ERROR = np.deg2rad(0.3)
 """Error of a predicted bend angle that is taken for granted before its residual is known [rad]."""
 CORRELATION = 20.0
 """Rows over which an error of the model stays the same (1 s), and which part slow from fast."""
-LEAST_ERRORS = np.array([[ANGLE_ERROR], [np.deg2rad(0.1)]])
-"""Least errors (2, 1) for which bend angles are weighed: slow and fast ones, of any model and of
-tags [rad]."""
+LEAST_ERRORS = np.array([[ANGLE_ERROR], [np.deg2rad(0.1)], [ANGLE_ERROR]])
+"""Least errors (3, 1) for which bend angles are weighed: slow, fast ones, and slow ones of a limb
+that was shaken; of any model, and of tags [rad]."""
 BENDS_ON = np.deg2rad(2.0)
 """Rate of the bend that pressures ask for from which on friction does not turn round [rad/s]."""
+SHAKES = 0.5
+"""The same rate from which on a limb swings so much that what its friction held lets go [rad/s]."""
+SHAKEN = 4.0
+"""Time for which that is so afterwards [s]."""
+SHAKEN_WORSE = 8.0
+"""Slow errors then over those elsewhere, at least."""
+WAITS = 5
+"""Rows between those in which pressures drive a segment and those in which it swings alone."""
 SWING_SMOOTHED = 2.0
 """Standard deviation of the smoothing of measured swings: noise would let go of friction [rows]."""
 SOFTNESS = 3.0
@@ -331,12 +338,14 @@ class BendFit:
         self.free, self._model, self._logs, self._more_rows = free, model, logs, more_rows
         self._last: tuple[bytes, list[Predicted] | None] = (b"", None)
         self._bends_on = [_bends_on(free.limb, log) for log in logs]
-        self.weigh(np.full((2, free.limb.segment_count), ANGLE_ERROR))
+        self._shaken = [_shaken(free.limb, log) for log in logs]
+        self.weigh(np.full((3, free.limb.segment_count), ANGLE_ERROR))
         self._weighed = False
 
     def weigh(self, errors: Array) -> None:
-        """Take errors (2, M) of bend angles for granted, see `LEAST_ERRORS` [rad]."""
+        """Take errors (3, M) of bend angles for granted, see `LEAST_ERRORS` [rad]."""
         self.errors = np.maximum(errors, 1e-3 * ANGLE_ERROR)
+        self.errors[2] = np.maximum(errors[2], SHAKEN_WORSE * errors[0])
         self._weighed = True
         unknowns = self.free.unknowns
         self.search = LeastSquares(unknowns, self._rows, SOFTNESS / np.sqrt(CORRELATION))
@@ -381,12 +390,15 @@ class BendFit:
         if found is None:
             return None
         errors, slopes, scale = [], [], np.sqrt(CORRELATION)
-        for log, part, on in zip(self._logs, found, self._bends_on, strict=True):
+        masks = zip(self._logs, found, self._bends_on, self._shaken, strict=True)
+        for log, part, on, shaken in masks:
             rows = log.usable
             left = _apart(part.angles[rows] - log.log.bend_angles[rows])
             by = _apart(part.angles_by[rows])
-            usual = np.repeat(self.errors[:, None], rows.sum(), axis=1)
+            usual = np.repeat(self.errors[:2, None], rows.sum(), axis=1)
             usual[1, ~on[rows]] = self.errors[0]  # elsewhere fast errors count as slow ones do
+            usual[0, shaken[rows]] = self.errors[2]
+            usual[1, shaken[rows] & ~on[rows]] = self.errors[2]
             for error, change, weight in zip(left, by, 1.0 / (usual * scale), strict=True):
                 errors.append((weight * error).ravel())
                 slopes.append((weight[..., None] * change).reshape(-1, len(values)))
@@ -418,7 +430,7 @@ class BendFit:
         )
 
     def errors_left(self, values: Array) -> Array:
-        """Return the errors (2, M) [rad] that values (P,) leave, see `LEAST_ERRORS`.
+        """Return the errors (3, M) [rad] that values (P,) leave, see `LEAST_ERRORS`.
 
         Slow ones are as large as errors that stay the same for `CORRELATION` rows would have to be.
         """
@@ -431,7 +443,8 @@ class BendFit:
         independent = slow.size / max(length, CORRELATION)
         left = max(independent - len(self.free.unknowns.prior), 0.5 * independent)
         longer = max(length / CORRELATION, 1.0) * independent / left
-        parts = [longer * slow**2, fast**2]
+        shaken = np.concatenate(self._shaken)[usable]
+        parts = [longer * slow[~shaken] ** 2, fast**2, longer * slow[shaken] ** 2]
         return np.sqrt([part.sum(axis=0) / max(len(part), 1) for part in parts])
 
     def excess(self, remaining: Array) -> float:
@@ -482,7 +495,8 @@ class BendFit:
 def _apart(table: Array) -> tuple[Array, Array]:
     """Return the slow part of a table (K, …), its mean over `CORRELATION` rows, and the rest.
 
-    While all segments bend on, friction stays the same, and what is fast is the swing of the body.
+    Friction that turns round in a swing is taken for stiffness or damping. While all segments bend
+    on it stays the same, and what is fast is the swing of the body.
     """
     slow: Array = uniform_filter1d(table, round(CORRELATION), axis=0, mode="nearest")
     return slow, table - slow
@@ -493,14 +507,27 @@ def _rubs_along(material: Material, log: Prepared) -> Array:
     rest = material.resting_bend(log.log.time, log.pressure)
     if not log.swings:
         return rest
-    slow, _ = _apart(rest)
     _, swing = _apart(gaussian_filter1d(log.bend, SWING_SMOOTHED, axis=0, mode="nearest"))
-    return slow + swing
+    waits = np.abs(np.gradient(rest, CONTROL_PERIOD, axis=0)) < BENDS_ON
+    waits = binary_erosion(waits, np.ones((2 * WAITS + 1, 1), dtype=bool))
+    along: Array = rest + waits * (swing - _apart(rest)[1])
+    return along
 
 
 def _bends_on(limb: Limb, log: Prepared) -> NDArray[np.bool_]:
     """Return the rows (K,) around which the pressures bend all segments on, each in one way."""
-    slow, _ = _apart(log.pressure)
-    rate = limb.static_gain * np.gradient(slow, CONTROL_PERIOD, axis=0)
+    rate = _bend_rate(limb, log, round(CORRELATION))
     on = log.usable & np.all(np.abs(rate) > BENDS_ON, axis=1)
     return np.asarray(binary_erosion(on, iterations=round(CORRELATION / 2)))
+
+
+def _shaken(limb: Limb, log: Prepared) -> NDArray[np.bool_]:
+    """Return the rows (K,) in which friction holds less than a model without swing says."""
+    jumps = np.any(np.abs(_bend_rate(limb, log, 5)) > SHAKES, axis=1)
+    return np.convolve(jumps, np.ones(round(SHAKEN / CONTROL_PERIOD)))[: len(jumps)] > 0.5
+
+
+def _bend_rate(limb: Limb, log: Prepared, rows: int) -> Array:
+    """Return the rate (K, M) of the bend that the pressures ask for, over some rows [rad/s]."""
+    pressure = uniform_filter1d(log.pressure, rows, axis=0, mode="nearest")
+    return limb.static_gain * np.gradient(pressure, CONTROL_PERIOD, axis=0)
