@@ -257,6 +257,22 @@ def test_what_friction_may_hide_of_a_touch_does_not_end_it(model):
     assert not TouchSense(model, calibrated()).look(now).touched
 
 
+def test_a_light_touch_that_friction_may_hide_is_suspected_until_it_is_over(model):
+    sense, hit = TouchSense(model, calibrated()), lacking(model, {20: (0.0, 0.2)})
+    felt = sense.look(hit)
+    assert felt.suspected
+    light = replace(hit, value=np.sqrt(0.4 / felt.distance) * hit.value)
+    sense = TouchSense(model, calibrated())
+    hides = 2.0 * np.stack([np.minimum(light.value[:2], 0.0), np.maximum(light.value[:2], 0.0)])
+    hidden, over = replace(light, stuck=hides), replace(light, value=np.zeros(4))
+    said = [
+        sense.look(replace(each, time=1.0 + k / 30))
+        for k, each in enumerate([over, hidden, light, hidden, over])
+    ]
+    assert not any(each.touched for each in said)
+    assert [each.suspected for each in said] == [False, False, True, True, False]
+
+
 def sliding(sense, time, missing, doubt=40.0, mass=0.0):
     """Feel a limb that bends by 0.1 rad/s, with rates that are hardly known, and lacks pressure.
 
@@ -409,6 +425,22 @@ def test_corrections_stay_while_something_touches_and_come_back_slowly(model, to
         halfway = reaction.corrected(first + 3000.0)
     reaction.follow(CHAMBERS, touch, CHAMBERS)
     np.testing.assert_array_equal(reaction.corrected(first + 3000.0), halfway)
+
+
+def test_corrections_shrink_but_do_not_grow_while_a_touch_is_suspected(model):
+    reaction, first = Reaction(model, "yield"), np.array([500.0, -200.0])
+    reaction.corrected(first)
+    suspected = replace(untouched(1.0, np.zeros(2)), suspected=True)
+    reaction.follow(CHAMBERS, suspected, CHAMBERS)
+    np.testing.assert_array_equal(reaction.corrected(3.0 * first), first)
+    np.testing.assert_array_equal(reaction.corrected(0.5 * first), 0.5 * first)
+    np.testing.assert_array_equal(reaction.corrected(first), 0.5 * first)
+    np.testing.assert_array_equal(reaction.corrected(-first), 0.0 * first)
+    reaction.follow(CHAMBERS, untouched(2.0, np.zeros(2)), CHAMBERS)
+    np.testing.assert_array_equal(reaction.corrected(first), first)
+    warns = Reaction(model, "warn")
+    warns.follow(CHAMBERS, suspected, CHAMBERS)
+    np.testing.assert_array_equal(warns.corrected(first), first)
 
 
 def test_what_is_no_reaction_is_refused(model):

@@ -2,6 +2,8 @@
 
 Against what touches, the tip stays behind whatever is corrected: corrections stay what they were,
 and come back slowly once the touch has ended, since the plan may press on what the limb has left.
+Where a touch is only suspected, they may shrink but not grow: friction hides a light touch for
+seconds, in which corrections pressed twice as hard as the plan.
 
 A touch is worth an effective pressure ℓ per segment (`Touch.pressure`): bending further against it
 raises the force. A change δu of the pressures in the chambers does so as far as −ℓ·δu > 0. While
@@ -55,7 +57,7 @@ class Reaction:
         self._held: Array | None = None
         self._bound = np.zeros(model.inputs), 0.0
         self._free, self._kept = 1.0, np.zeros(model.inputs)
-        self._newest = self._kept
+        self._newest, self._suspected = self._kept, False
 
     @property
     def acts(self) -> bool:
@@ -76,6 +78,7 @@ class Reaction:
             chambers: (M,) differential pressures in them now [Pa].
         """
         harder, bound = self._bound
+        self._suspected = touch.suspected and self.acts
         if not (touch.touched and self.acts):
             if self.limit is None or not (self.kind == "yield" and harder @ planned > bound):
                 self._held = None
@@ -117,5 +120,11 @@ class Reaction:
         return wanted - harder * (max(0.0, float(harder @ wanted) - bound) / square)
 
     def mixed(self, wanted: Array) -> Array:
-        """Return wanted corrections (…, M) [Pa] as far as they have come back after a touch."""
-        return self._kept + self._free * (wanted - self._kept)
+        """Return wanted corrections (…, M) [Pa] as far as they have come back after a touch.
+
+        While one is suspected they are between none and what was sent last.
+        """
+        back: Array = self._kept + self._free * (wanted - self._kept)
+        if self._suspected and self._held is None:
+            back = np.clip(back, np.minimum(self._newest, 0.0), np.maximum(self._newest, 0.0))
+        return back

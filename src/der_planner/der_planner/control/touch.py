@@ -14,7 +14,8 @@ force of the largest likelihood is then linear; the likelihood of the places, ea
 gives place and force with what is in doubt of them.
 
 Without contact the same numbers are not zero either (`der_planner.control.free_level`). A distance
-from that free level which noise would pass once in an hour is a touch.
+from that free level which noise would pass once in an hour is a touch. A seventh of it is a
+suspicion: friction may hide a light touch for seconds.
 
 What begins at once to pull at the tip along gravity, and goes on, is a payload: it is weighed,
 belongs to the free level from then on, and is not a touch. So is one that is taken off. Something
@@ -49,6 +50,9 @@ _FOLLOWS = 0.3
 """Time in which the estimator follows what it did not expect, as friction that turned round [s]."""
 _RELEASED = 0.5
 """Share of the threshold below which a touch ends."""
+_SUSPECTED = 0.15
+"""Share of the threshold from which on something may touch that friction hides: corrections do not
+grow then."""
 _LEARNED_AFTER = 0.4
 """What is over within that time is learned, touch or not: contact that begins slowly is not [s]."""
 _TOUCHED_FORGETS = 0.1
@@ -112,6 +116,7 @@ class Touch:
         said: a sentence on what is told; empty while nothing touches or pulls.
         payload: at the tip, beside what was planned [kg].
         weighed: whether what touches may yet turn out to be a payload.
+        suspected: whether something touches, or may touch while friction hides it.
     """
 
     time: float
@@ -127,6 +132,7 @@ class Touch:
     said: str
     payload: float = 0.0
     weighed: bool = False
+    suspected: bool = False
 
 
 def untouched(time: float, bend_angles: Array, distance: float = 0.0) -> Touch:
@@ -226,7 +232,8 @@ class TouchSense:
         else:
             said = f"{1000 * payload:.0f} g more at the tip than planned" if payload else ""
             found = replace(untouched(lacking.time, lacking.bend_angles, distance), said=said)
-        self.newest = replace(found, payload=payload)
+        suspected = touched or self._suspects(away, distance)
+        self.newest = replace(found, payload=payload, suspected=suspected)
         learned = lacking.time - _LEARNED_AFTER
         while not touched and self._recent and self._recent[0][0].time < learned:
             self._learned = self._recent[0][0].time
@@ -263,6 +270,20 @@ class TouchSense:
             left = away.value
             doubts.append(noise + self._noticed - self._lately[-1].covariance)
         return float(max(left @ np.linalg.solve(each, left) for each in doubts)) / self.threshold
+
+    def _suspects(self, away: Lacking, distance: float) -> bool:
+        """Return whether something may touch that does not reach the threshold, or not any more.
+
+        Friction that segments take up later may hide it, but does not end the suspicion.
+
+        Args:
+            away: from the free level, with the covariance of that.
+            distance: see `_distance`.
+        """
+        if not self.newest.suspected:
+            return distance > _SUSPECTED
+        whole = away.value @ np.linalg.solve(away.covariance, away.value) / self.threshold
+        return max(distance, float(whole)) > _RELEASED * _SUSPECTED
 
     def _lets_go(self, lacking: Lacking, variance: Array) -> bool:
         """Return whether what seems to touch is the end of something; go back to its free level.
