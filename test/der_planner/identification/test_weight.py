@@ -8,7 +8,9 @@ from limbs import with_segments
 
 from der_planner.identification import CalibrationLog, LogError
 from der_planner.identification.log import Prepared
+from der_planner.identification.report import Unknown
 from der_planner.identification.stiffness import HungWeight
+from der_planner.identification.told import against_motion
 from der_planner.limb import Limb, PointMass
 from der_planner.model import RodModel
 
@@ -80,3 +82,16 @@ def test_a_segment_that_friction_holds_tells_nothing():
     )
     _, deviation = hung.stiffness_change(LIMB, rubbing)
     assert np.isfinite(deviation).tolist() == [True, False]
+
+
+def test_a_weight_that_contradicts_the_motion_is_named():
+    moved = [
+        Unknown("log_stiffness[0]", "1", 0.0, 0.08),
+        Unknown("friction[0]", "N m", 0.7, 0.1),
+        Unknown("log_stiffness[1]", "1", 0.0, 0.5, untold=True),
+    ]
+    said = list(against_motion(moved, np.log([2.0, 2.0]), np.array([0.1, 0.1])))
+    assert len(said) == 1
+    assert "stiffness[0] is 2.00 times" in said[0]
+    assert not list(against_motion(moved, np.log([1.3, 0.5]), np.array([0.1, 0.1])))
+    assert not list(against_motion(moved, np.array([2.0, 2.0]), np.full(2, np.inf)))

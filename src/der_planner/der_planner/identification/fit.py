@@ -42,7 +42,13 @@ from der_planner.identification.log import (
 )
 from der_planner.identification.report import FitReport
 from der_planner.identification.stiffness import HungWeight, stiffness_in_motion
-from der_planner.identification.told import at_bounds, kept_unknowns, told, untold_stiffness
+from der_planner.identification.told import (
+    against_motion,
+    at_bounds,
+    kept_unknowns,
+    told,
+    untold_stiffness,
+)
 from der_planner.limb import CalibratedRange, Limb
 from der_planner.model import ArcModel, Material, RodModel
 from der_planner.planning.loads import nearly_buckling
@@ -143,6 +149,8 @@ def _fit(
     warnings += filter(None, [lengths_at_their_end(limb, fitted.known)])
     if hung is not None:
         change, deviation = hung.stiffness_change(fitted.known, fitted.limb)
+        moved, _ = told(fitted.problem, fitted.values)
+        warnings += against_motion(moved, change, deviation)
         weighed = fitted.free.told("log_stiffness", change, deviation)
         fitted = _again(fitted, weighed, prepared)
     unknowns, correlation = told(fitted.problem, fitted.values)

@@ -20,6 +20,9 @@ UNTOLD = 0.8
 tell it."""
 STIFFNESS_ERROR = 0.05
 """Least deviation of the logarithm of a stiffness: no model's friction is that of the limb."""
+ANOTHER_STIFFNESS = 3.0, math.log(1.5)
+"""Differences of the logarithm of a stiffness by a known weight from that by motion beyond which
+one of them is wrong: over their standard deviation, and as it is. Both must be passed."""
 EXPERIMENTS = {
     "linear": "slow pressures both ways on each segment, in the units of the log,",
     "asymmetry": "slow pressures both ways on each segment",
@@ -54,6 +57,28 @@ def untold_stiffness(free: FreeTerms, unknowns: Sequence[Unknown]) -> tuple[Mask
         f"the log hardly tells the stiffness of segment {' and '.join(segments)}: it stays as it "
         f"was known before; {EXPERIMENTS['dynamics']} would tell it"
     )
+
+
+def against_motion(unknowns: Sequence[Unknown], weighed: Array, doubt: Array) -> Iterator[str]:
+    """Yield a sentence for each segment of which a known weight and motion tell another stiffness.
+
+    Args:
+        unknowns: of a fit that does not know of the weight.
+        weighed: (M,) logarithms of the stiffness by the weight.
+        doubt: (M,) their standard deviations; infinite: the weight does not tell it.
+    """
+    moved = [each for each in unknowns if each.name.startswith("log_stiffness")]
+    deviations, least = ANOTHER_STIFFNESS
+    for each, value, error in zip(moved, weighed, doubt, strict=False):
+        apart = float(value) - each.value
+        if not each.untold and abs(apart) > max(
+            deviations * math.hypot(each.deviation, error), least
+        ):
+            yield (
+                f"by the weight {each.name.removeprefix('log_')} is {math.exp(apart):.2f} times "
+                "what the limb's motion tells: check the weight's mass (--weight) and place "
+                "(--at), and that nothing else touched the limb"
+            )
 
 
 def kept_unknowns(free: FreeTerms) -> Iterator[Unknown]:
