@@ -1,6 +1,7 @@
 """The experiment's command line: what is refused, and what order trials are played in."""
 
 import json
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ from der_planner.experiment.console import OptionError
 from der_planner.experiment.options import parse
 from der_planner.experiment.processes import GraphSetup, Hardware
 from der_planner.limb import Limb, PointMass
+from der_planner.planning import ObstacleError
 
 
 @pytest.mark.parametrize(
@@ -101,6 +103,8 @@ def test_a_stopped_experiment_goes_on_and_refuses_other_options(tmp_path: Path):
     assert again.finished(second) is None
     with pytest.raises(OptionError, match=r"period = 20\.0, not 6\.0"):
         Ledger(parse([*arguments, "--period", "6"])).finished(first)
+    with pytest.raises(OptionError, match="reaction = yield, not warn"):
+        Ledger(parse([*arguments, "--reaction", "warn"])).finished(first)
     # Another path of the same name is not taken for done.
     file = tmp_path / "curve.csv"
     file.write_text("x,y\n0.20,0.10\n0.19,0.12\n")
@@ -111,6 +115,19 @@ def test_a_stopped_experiment_goes_on_and_refuses_other_options(tmp_path: Path):
     file.write_text("x,y\n0.20,0.10\n0.18,0.12\n")
     with pytest.raises(OptionError, match="path_sha256"):
         Ledger(parse(drawn)).finished(trial)
+
+
+def test_a_motion_into_an_obstacle_is_refused_before_anything_is_started(tmp_path: Path):
+    file, limb = tmp_path / "peg.yaml", tmp_path / "limb.yaml"
+    Limb.default().to_yaml(limb)
+    motion = ["--amplitude", "0.4", "--period", "4", "--cycles", "1", "--method", "projected"]
+    arguments = [*motion, "--models", "der", "--limb", str(limb), "--obstacles", str(file)]
+    for place, refused in ((0.09, True), (-0.2, False)):
+        peg = {"circle_m": [0.2, place], "radius_m": 0.02}
+        file.write_text(json.dumps({"limb_radius_m": 0.015, "obstacles": [peg]}))
+        options = parse(arguments)
+        with pytest.raises(ObstacleError) if refused else nullcontext():
+            options.check_motions(Limb.default(), options.plan_of_trials())
 
 
 def test_loads_are_those_of_the_command_line():

@@ -157,6 +157,9 @@ class Ledger:
             "poses": "yes" if options.poses else "",
             "hardware": options.hardware.place if options.hardware else "",
             "board": options.board,
+            "obstacles_sha256": _digest(options.obstacles),
+            "reaction": options.reaction,
+            "force_limit": options.force_limit or "",
         }
 
     def finished(self, trial: Trial) -> dict[str, Any] | None:

@@ -207,15 +207,19 @@ class Options:
         """Refuse what the limb cannot do before anything is started.
 
         Raises:
-            PlanningError: numbers of a motion, or a path that is out of reach.
+            PlanningError: numbers of a motion, a path that is out of reach, or obstacles in the
+                way of either.
         """
         rod = None if self.calibrate else RodModel(limb)
         for name, model in {(trial.motion, trial.model) for trial in trials}:
             motion = self.motion(name)
-            if rod is not None:
+            if rod is None:  # what a limb reaches is known once it is calibrated
+                if motion.path is not None:
+                    motion.path.check_unit(limb.length)
+            elif self.obstacles:  # only a plan tells whether there is a way past them
+                plan(limb, motion, model, self.method, obstacles=self.in_the_way)
+            else:
                 followed(motion, rod, rod if model == "der" else Model.of(limb, model), None)
-            elif motion.path is not None:  # what a limb reaches is known once it is calibrated
-                motion.path.check_unit(limb.length)
 
     def other_twin(self, limb: Limb) -> str:
         """Return a sentence where the limb file is of another twin than a trial's; else empty."""

@@ -63,7 +63,7 @@ class _Corrected:
         self.revisions: dict[int, int] = {}
         self.warned = 0
         self.touched = self.felt = -math.inf
-        self.vented = False
+        self.touching = self.vented = False
         self.payload = feedback.touch.payload
 
     def time_of(self, stamp: int) -> float:
@@ -283,7 +283,7 @@ class Corrector:
         )  # fmt: skip
 
     def _react(self, each: _Corrected) -> None:
-        """Say that something touches the limb, once for each touch, and vent it if that is set."""
+        """Say when a touch begins and when it ends, and vent the limb if that is set."""
         touch = each.feedback.touch
         if touch.time > each.felt:
             each.felt = touch.time
@@ -292,6 +292,9 @@ class Corrector:
             each.touched = touch.since
             text = f"plan {each.schedule.plan_id}, {touch.since:.2f} s: something touches the limb"
             self._warn(f"{text}: {touch.said}")
+        elif each.touching and not touch.touched:
+            self._warn(f"plan {each.schedule.plan_id}, {touch.time:.2f} s: nothing touches it now")
+        each.touching = touch.touched
         if touch.payload != each.payload:
             each.payload = touch.payload
             self._warn(
