@@ -77,6 +77,24 @@ def test_resting_bend_is_where_moment_and_effective_pressure_agree():
     np.testing.assert_allclose(held[1:], (limb.static_gain * effective)[1:], atol=1e-9)
 
 
+@pytest.mark.parametrize("mounting", ["horizontal", "sideways"])
+@pytest.mark.parametrize(
+    "name", ["moment_gain", "friction_moment", "friction_curvature", "creep_time", "rest_curvature"]
+)
+def test_the_bend_at_rest_changes_as_the_difference_of_two(name, mounting):
+    limb, step = rubbing().mounted(mounting), 1e-4
+    material, pressures = Material(limb), 0.5 * WANTED
+    rest = material.resting_bend(TIME, pressures)
+    nudged = Material(with_segments(limb, **{name: lambda s: (1.0 + step) * getattr(s, name)}))
+    driven = (m.driven_bend(TIME, pressures, rest) for m in (nudged, material))
+    change = (next(driven) - next(driven))[..., None] / step
+    found = material.resting_bend_change(TIME, pressures, rest, change)[..., 0]
+    expected = (nudged.resting_bend(TIME, pressures) - rest) / step
+    # Where a bend turns round between two instants, only the difference knows of it.
+    off = np.abs(found - expected).max(axis=1)
+    assert np.quantile(off, 0.95) < 0.02 * np.abs(expected).max()
+
+
 def test_coupling_adds_the_share_of_the_neighbours_pressure():
     limb = Limb.default()
     first, second = limb.segments

@@ -253,7 +253,8 @@ def follow(model: Model, log: Prepared, *, linearise: bool = False) -> Response:
     Raises:
         RuntimeError: it cannot follow, or does not come to rest.
     """
-    bend, time = _rubs_along(model.material, log), log.log.time
+    time = log.log.time
+    bend = _rubs_along(model.material.resting_bend(time, log.pressure), log)
     return simulate(
         model, time, pressures=log.pressure, bend=lambda _: bend, steps=1, linearise=linearise
     )
@@ -283,8 +284,7 @@ def predicted(free: FreeTerms, model: Model, log: Prepared, values: Array) -> Pr
     angles, tip = response.bend_angles, response.tip
     angles_by, tip_by = (np.empty((*part.shape, len(values))) for part in (angles, tip))
     if response.derivative is not None:
-        moments = [_moments(nudged, log, angles) for nudged in compress(limbs, driven)]
-        change = np.stack(moments, axis=2) - _moments(limb, log, angles)[..., None]
+        change = _moments_change(limb, list(compress(limbs, driven)), log, angles)
         change /= _gain(limb)[:, None] * _NUDGE * scale[driven]
         tip_by[:, :, driven], angles_by[:, :, driven] = response.derivative.by_effective(change)
     for place in np.flatnonzero(np.logical_not(driven)):
@@ -303,10 +303,29 @@ def _same_body(limb: Limb, other: Limb) -> bool:
     return all(getattr(a, key) == getattr(b, key) for a, b in pairs for key in _OF_THE_BODY)
 
 
-def _moments(limb: Limb, log: Prepared, angles: Array) -> Array:
-    """Return the moments (K, M) that drive the limb, less the elastic ones of its bend [N·m]."""
+def _moments_change(limb: Limb, nudged: list[Limb], log: Prepared, angles: Array) -> Array:
+    """Return the changes (K, M, P) of `_moments` by P limbs that differ a little [N·m]."""
+    time, pressure, material = log.log.time, log.pressure, Material(limb)
+    rest = material.resting_bend(time, pressure)
+    before = material.driven_bend(time, pressure, rest)
+    driven = [Material(each).driven_bend(time, pressure, rest) - before for each in nudged]
+    moved = material.resting_bend_change(time, pressure, rest, np.stack(driven, axis=2))
+    moments = [
+        _moments(each, log, angles, _rubs_along(rest + moved[..., place], log))
+        for place, each in enumerate(nudged)
+    ]
+    here = _moments(limb, log, angles, _rubs_along(rest, log))
+    change: Array = np.stack(moments, axis=2) - here[..., None]
+    return change
+
+
+def _moments(limb: Limb, log: Prepared, angles: Array, along: Array) -> Array:
+    """Return the moments (K, M) that drive the limb, less the elastic ones of its bend [N·m].
+
+    Friction and creep act along another bend (K, M) [rad].
+    """
     material = Material(limb)
-    taken = material.memory_pressures(log.log.time, _rubs_along(material, log))
+    taken = material.memory_pressures(log.log.time, along)
     driving = _gain(limb) * material.without_memory(log.pressure, taken)
     lengths = np.array([segment.length for segment in limb.segments])
     rest, linear, cubic = np.array(
@@ -502,9 +521,13 @@ def _apart(table: Array) -> tuple[Array, Array]:
     return slow, table - slow
 
 
-def _rubs_along(material: Material, log: Prepared) -> Array:
-    """Return the bend angles (K, M) along which friction and creep act in a log, see the module."""
-    rest = material.resting_bend(log.log.time, log.pressure)
+def _rubs_along(rest: Array, log: Prepared) -> Array:
+    """Return the bend angles (K, M) along which friction and creep act in a log, see the module.
+
+    Args:
+        rest: (K, M) of the model at rest [rad].
+        log: prepared.
+    """
     if not log.swings:
         return rest
     _, swing = _apart(gaussian_filter1d(log.bend, SWING_SMOOTHED, axis=0, mode="nearest"))

@@ -244,12 +244,46 @@ class Material:
         bend = self.resting_bend(time, differential, start)
         effective, _ = self.slow(time, differential, start)
         _, stiffer, gain, stiffening = self._drive(differential)
-        moved = change * gain + change @ self._coupling.T, change * stiffening
-        taken = change_along(
-            np.ascontiguousarray(time), stiffer, bend, self.resting_law, self._begin(start), moved
+        moved = change * gain + change @ self._coupling.T - effective * change * stiffening
+        law = self.resting_law
+        pushed = (law.gain * moved / stiffer)[..., None]
+        _, taken = change_along(
+            np.ascontiguousarray(time), stiffer, bend, law, self._begin(start), pushed
         )
-        result: Array = (moved[0] - taken - effective * moved[1]) / stiffer
+        result: Array = (moved - taken[..., 0]) / stiffer
         return result
+
+    def driven_bend(self, time: Array, differential: Array, bend: Array) -> Array:
+        """Return what pressures, friction and creep bend (K, M) beside the elastic moment [rad].
+
+        Where it is less the weight's share, the bend is that of a limb at rest.
+
+        Args:
+            time: (K,) [s].
+            differential: (K, M) in the chambers [Pa].
+            bend: (K, M) along which friction and creep act [rad].
+        """
+        law, bent = self.resting_law, bend - self.resting_law.rest
+        effective = self.without_memory(differential, self.memory_pressures(time, bend))
+        beside: Array = law.gain * effective - bent - law.cubic * bent**3
+        return beside
+
+    def resting_bend_change(
+        self, time: Array, differential: Array, bend: Array, driven: Array
+    ) -> Array:
+        """Return the first-order changes (K, M, P) of a bend at rest [rad].
+
+        Args:
+            time: (K,) [s].
+            differential: (K, M) in the chambers [Pa].
+            bend: (K, M) found by `resting_bend` without a start [rad].
+            driven: (K, M, P) changes of `driven_bend` [rad].
+        """
+        _, stiffer, _, _ = self._drive(differential)
+        change: Array = change_along(
+            np.ascontiguousarray(time), stiffer, bend, self.resting_law, self._begin(None), driven
+        )[0]
+        return change
 
     def weight_torques(self, bend_angle: Array) -> Array:
         """Return the torques (K, M) of the weight on the bend angles (K, M) [N·m]."""

@@ -25,7 +25,7 @@ _PIECES = 4
 """Straight pieces of a segment that carry its weight."""
 _ROUNDS = 200
 """Sweeps over the segments at the most; without weight one is enough."""
-_CLOSE = 1e-8
+_CLOSE = 1e-7
 """Change of a bend angle in a sweep with which its balance is found [rad]."""
 _LARGEST_STEP = 0.3
 """Of a bend angle in one iteration [rad]."""
@@ -233,40 +233,45 @@ def balanced_bend(
         angle = min(max(angle - step, law.rest[i] - _LARGEST_BEND), law.rest[i] + _LARGEST_BEND)
         if (angle - last) * sign < 0.0:
             angle = last
-        if abs(step) < 1e-12:
+        if abs(step) < 1e-9:
             break
     return angle
 
 
 @njit(cache=True)
 def change_along(
-    time: Array,
-    stiffer: Array,
-    bend: Array,
-    law: RestingLaw,
-    begin: Array,
-    change: tuple[Array, Array],
-) -> Array:
-    """Return the change (K, M) of f z + c q [Pa] by changes (K, M) of ``driven`` and ``stiffer``.
+    time: Array, stiffer: Array, bend: Array, law: RestingLaw, begin: Array, driven: Array
+) -> tuple[Array, Array]:
+    """Return what P small changes make of a bend at rest, to first order.
 
-    First order, along bend angles (K, M) found by `rest_along`, by the implicit function theorem on
-    the step's residual φ + k φ³ − W(θ) − g (driven − f z' − c q') / stiffer = 0 with z' = s + (z −
-    s) exp(−|Δθ| / turn), s the sign of Δθ, and q' = keep q + share Δθ. The start is at rest under
-    ``driven[0]``, or given and fixed.
+    Along bend angles (K, M) found by `rest_along`, by the implicit function theorem on the residual
+    of each instant, φ + k φ³ − W(θ) − g (driven − f z' − c q') / stiffer with z' = s + (z − s)
+    exp(−|Δθ| / turn), s the sign of Δθ, and q' = keep q + share Δθ. The start is at rest, or given
+    and fixed.
+
+    Args:
+        time: (K,) [s].
+        stiffer: (K, M) growth of the stiffness.
+        bend: (K, M) [rad].
+        law: of the segments.
+        begin: as of `rest_along`.
+        driven: (K, M, P) change of g (driven − f z − c q) / stiffer − φ − k φ³ + W at a given bend
+            [rad].
+
+    Returns:
+        (K, M, P) changes of the bend [rad], and of f z + c q by that of the bend [Pa].
     """
-    instants, count = bend.shape
-    result = np.empty((instants, count))
+    instants, count, changes = driven.shape
+    bend_by, taken_by = np.empty(driven.shape), np.empty(driven.shape)
     known = not np.isnan(begin[0, 0])
     z = begin[:, 1].copy() if known else np.zeros(count)
     torque, slope = np.zeros(count), np.zeros((count, count))
-    angle_moved: Array = np.zeros(count)
-    z_moved: Array = np.zeros(count)
-    q_moved: Array = np.zeros(count)
+    angle_moved, z_moved, q_moved = np.zeros((3, count, changes))
     for k in range(instants):
         weigh(bend[k], law, torque, slope)
-        matrix, right = -slope, np.zeros(count)
-        z_kept, z_by_change = np.zeros(count), np.zeros(count)
-        q_kept, q_by_change = np.zeros(count), np.zeros(count)
+        matrix, right = -slope, driven[k].copy()
+        z_kept, z_by_change = np.zeros((count, 1)), np.zeros((count, 1))
+        q_kept, q_by_change = np.zeros((count, 1)), np.zeros((count, 1))
         for i in range(count):
             bent = bend[k, i] - law.rest[i]
             scale = law.gain[i] / stiffer[k, i]
@@ -274,23 +279,23 @@ def change_along(
                 rate = (time[k] - time[k - 1]) / law.relaxation[i]
                 turned = bend[k, i] - bend[k - 1, i]
                 sign = 1.0 if turned >= 0.0 else -1.0
-                z_kept[i] = np.exp(-abs(turned) / law.turn[i])
-                z_by_change[i] = (1.0 - z[i] * sign) * z_kept[i] / law.turn[i]
-                q_kept[i] = np.exp(-rate)
-                q_by_change[i] = (1.0 - q_kept[i]) / rate
-                z[i] = sign + (z[i] - sign) * z_kept[i]
-            rub = scale * (law.friction[i] * z_by_change[i] + law.creep[i] * q_by_change[i])
+                z_kept[i, 0] = np.exp(-abs(turned) / law.turn[i])
+                z_by_change[i, 0] = (1.0 - z[i] * sign) * z_kept[i, 0] / law.turn[i]
+                q_kept[i, 0] = np.exp(-rate)
+                q_by_change[i, 0] = (1.0 - q_kept[i, 0]) / rate
+                z[i] = sign + (z[i] - sign) * z_kept[i, 0]
+            rub = scale * (law.friction[i] * z_by_change[i, 0] + law.creep[i] * q_by_change[i, 0])
             matrix[i, i] += 1.0 + 3.0 * law.cubic[i] * bent**2 + rub
-            balanced = bent + law.cubic[i] * bent**3 - torque[i]
-            right[i] = rub * angle_moved[i] + scale * change[0][k, i]
-            right[i] -= scale * law.friction[i] * z_kept[i] * z_moved[i]
-            right[i] -= scale * law.creep[i] * q_kept[i] * q_moved[i]
-            right[i] -= balanced / stiffer[k, i] * change[1][k, i]
-        after: Array = np.zeros(count)
+            right[i] += rub * angle_moved[i]
+            right[i] -= scale * law.friction[i] * z_kept[i, 0] * z_moved[i]
+            right[i] -= scale * law.creep[i] * q_kept[i, 0] * q_moved[i]
+        after = np.zeros((count, changes))
         if k > 0 or not known:
             after[:] = np.linalg.solve(matrix, right)
         z_moved = z_kept * z_moved + z_by_change * (after - angle_moved)
         q_moved = q_kept * q_moved + q_by_change * (after - angle_moved)
         angle_moved = after
-        result[k] = law.friction * z_moved + law.creep * q_moved
-    return result
+        bend_by[k] = after
+        for i in range(count):
+            taken_by[k, i] = law.friction[i] * z_moved[i] + law.creep[i] * q_moved[i]
+    return bend_by, taken_by
