@@ -7,20 +7,20 @@ of bend and tip by the force, C_w of the bend by pressure, and J = ∂tip/∂θ 
 
     lacking pressure = C_w⁻¹ C_θ(s) f        b = (C_r(s) − J C_θ(s)) f
 
-These are M + 2 numbers for the three unknowns of a force in the plane. What a force along the limb
-does to it is hardly seen, and what touches the limb from its side pushes across it, with some
-friction: the part along the limb is expected to be a share of that across. For every place the
-force of the largest likelihood is then linear; the likelihood of the places, each with its force,
-gives place and force with what is in doubt of them.
+These are M + 2 numbers for the three unknowns of a force in the plane. They hardly show the part of
+a force that acts along the limb. What touches the limb from its side pushes across it, with some
+friction: the part along the limb is therefore expected to be a share of the part across it. For
+each place the most likely force follows from linear equations. The likelihood of all places, each
+with its force, then gives place and force, with their deviations.
 
 Without contact the same numbers are not zero either (`der_planner.control.free_level`). A distance
 from that free level which noise would pass once in an hour is a touch. A seventh of it is a
 suspicion: friction may hide a light touch for seconds.
 
-What begins at once to pull at the tip along gravity, and goes on, is a payload: it is weighed,
-belongs to the free level from then on, and is not a touch. So is one that is taken off. Something
-fixed may push the same way, but no faster than the limb is driven against it. Where gravity has no
-part in the plane, a payload cannot be told.
+A payload is told apart from a touch in this way: it begins at once to pull at the tip along
+gravity, and goes on. It is weighed, and is part of the free level from then on; one that is taken
+off leaves it again. A fixed obstacle may push the same way, but no faster than the limb is driven
+against it. Where gravity does not act in the plane, a payload cannot be told.
 """
 
 from __future__ import annotations
@@ -433,19 +433,18 @@ def _told(found: Touch, left: float, model: RodModel) -> Touch:
     nothing = np.full(2, np.nan)
     spare = max(1, model.inputs - 1)
     if left > _chance(_UNLIKELY, spare):
-        return replace(
-            found, place=np.nan, force=nothing, said="at more than one point, or not by a force"
-        )
+        said = "at several points, or the model is wrong otherwise: no single force explains it"
+        return replace(found, place=np.nan, force=nothing, said=said)
     deviations, directions = np.linalg.eigh(found.force_covariance)
     size = float(np.linalg.norm(found.force))
     said = f"{size:.2f} N"
     where = f"at {found.place * 100:.1f} cm (± {found.place_deviation * 100:.1f})"
     if found.place_deviation > _PLACE_TOLD * model.limb.length:
-        found, where = replace(found, place=np.nan), "where cannot be told"
+        found, where = replace(found, place=np.nan), "its place is not known"
     widest = float(np.sqrt(deviations[-1]))
     if widest > size:
         x, y = directions[:, -1]
-        said = f"how strong along ({x:.2f}, {y:.2f}) cannot be told (± {widest:.2f} N)"
+        said = f"its force is not known along ({x:.2f}, {y:.2f}): ± {widest:.2f} N"
         found = replace(found, force=nothing)
     return replace(found, said=f"{said}, {where}")
 
