@@ -263,14 +263,17 @@ def test_a_light_touch_that_friction_may_hide_is_suspected_until_it_is_over(mode
     assert felt.suspected
     light = replace(hit, value=np.sqrt(0.4 / felt.distance) * hit.value)
     sense = TouchSense(model, calibrated())
-    hides = 2.0 * np.stack([np.minimum(light.value[:2], 0.0), np.maximum(light.value[:2], 0.0)])
-    hidden, over = replace(light, stuck=hides), replace(light, value=np.zeros(4))
+    pressures = light.value[:2]
+    one_way = np.stack([np.minimum(pressures, 0.0), np.maximum(pressures, 0.0)])
+    # The first could be friction alone; friction bears none of the second, but could bear more.
+    hidden, seen = replace(light, stuck=2.0 * one_way), replace(light, stuck=-4.0 * one_way[::-1])
+    over = replace(light, value=np.zeros(4))
     said = [
         sense.look(replace(each, time=1.0 + k / 30))
-        for k, each in enumerate([over, hidden, light, hidden, over])
+        for k, each in enumerate([over, hidden, light, seen, hidden, over])
     ]
     assert not any(each.touched for each in said)
-    assert [each.suspected for each in said] == [False, False, True, True, False]
+    assert [each.suspected for each in said] == [False, False, False, True, True, False]
 
 
 def sliding(sense, time, missing, doubt=40.0, mass=0.0):

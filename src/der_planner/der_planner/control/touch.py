@@ -274,14 +274,17 @@ class TouchSense:
     def _suspects(self, away: Lacking, distance: float) -> bool:
         """Return whether something may touch that does not reach the threshold, or not any more.
 
-        Friction that segments take up later may hide it, but does not end the suspicion.
+        Friction must be able to bear most of it. What a segment that slides lacks is a wrong gain,
+        which corrections are for. Friction that segments take up later does not end the suspicion.
 
         Args:
             away: from the free level, with the covariance of that.
             distance: see `_distance`.
         """
         if not self.newest.suspected:
-            return distance > _SUSPECTED
+            left = away.beside_friction[: away.stuck.shape[1]]
+            most = int(np.argmax(np.abs(left)))
+            return distance > _SUSPECTED and np.ptp(away.stuck[:, most]) > 2.0 * abs(left[most])
         whole = away.value @ np.linalg.solve(away.covariance, away.value) / self.threshold
         return max(distance, float(whole)) > _RELEASED * _SUSPECTED
 
