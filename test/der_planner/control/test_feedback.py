@@ -326,11 +326,13 @@ def test_a_wrong_shape_is_refused(planned):
         feedback.measure(0.0, [0.0], [0.0, 0.0])
     with pytest.raises(ValueError, match="covariance"):
         feedback.measure(0.0, [0.0, 0.0], [0.0, 0.0], np.eye(3))
+    with pytest.raises(ValueError, match="variances that are not negative"):
+        feedback.measure(0.0, [0.0, 0.0], [0.0, 0.0], -np.eye(2))
     with pytest.raises(ValueError, match="2 differential pressures"):
         feedback.pressures(0.0, [0.0])
 
 
-@pytest.mark.parametrize("time", [1.7e9, np.nan])
+@pytest.mark.parametrize("time", [1.7e9, 50.0, np.nan])
 def test_times_of_another_clock_are_refused(planned, time):
     feedback, zero = Feedback(planned), np.zeros(2)
     for tell in (

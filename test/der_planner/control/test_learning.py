@@ -278,3 +278,14 @@ def test_chambers_are_told_in_any_order_with_gaps_and_refused_where_they_do_not_
     nothing = Learner(first)
     nothing.add(first.time, tip, chambers=(time, np.full_like(held, np.nan)))
     assert nothing.next().chambers_beyond is None
+
+
+def test_of_chambers_after_their_last_reading_nothing_is_known(first):
+    made = simulate(LIMB, first.time, commands=first.differential_pressure)
+    held = made.differential_pressure.mean(axis=1) + 1500.0
+    kept = len(held) // 2
+    cut_short = Learner(first)
+    cut_short.add(first.time, play(first, other_limb()), chambers=(first.time[:kept], held[:kept]))
+    beyond = cut_short.next().chambers_beyond
+    assert np.abs(beyond[1 : kept - 1]).mean() > 1000.0
+    assert not beyond[kept:].any()

@@ -30,6 +30,9 @@ from der_planner.planning import ObstacleError
         (["--poses", "--offline"], "--poses is motion capture of the twin"),
         (["--board", "arduino"], "unknown board 'arduino'"),
         (["--reaction", "push"], "unknown reaction .push."),
+        (["--force-limit", "0.2"], "about feedback: add --feedback"),
+        (["--feedback", "--reaction", "hold", "--force-limit", "0.2"], "what the reaction yield"),
+        (["--feedback", "--force-limit", "200"], "--force-limit is 200"),
         (["--board", "festo", "--offline"], "--board is about the twin.s nodes"),
     ],
 )
@@ -104,7 +107,7 @@ def test_a_stopped_experiment_goes_on_and_refuses_other_options(tmp_path: Path):
     with pytest.raises(OptionError, match=r"period = 20\.0, not 6\.0"):
         Ledger(parse([*arguments, "--period", "6"])).finished(first)
     with pytest.raises(OptionError, match="reaction = yield, not warn"):
-        Ledger(parse([*arguments, "--reaction", "warn"])).finished(first)
+        Ledger(parse([*arguments, "--feedback", "--reaction", "warn"])).finished(first)
     # Another path of the same name is not taken for done.
     file = tmp_path / "curve.csv"
     file.write_text("x,y\n0.20,0.10\n0.19,0.12\n")

@@ -50,6 +50,14 @@ def test_other_units_are_named(door):
         prepare(replace(log, **change(log)), LIMB, to_fit=False)
 
 
+@pytest.mark.parametrize("wrong", [lambda tip: tip[:, ::-1], lambda tip: tip * [1.0, -1.0]])
+def test_tips_in_other_axes_than_the_limbs_are_refused(wrong):
+    log = slow_log()
+    prepare(log, LIMB)
+    with pytest.raises(LogError, match="x points along the straight limb"):
+        prepare(replace(log, tip=wrong(log.tip)), LIMB)
+
+
 def test_single_impossible_numbers_are_left_out_and_said():
     log = slow_log()
     log.bend_angles[100, 0], log.measured_differential[200, 1] = 1e9, -1e9

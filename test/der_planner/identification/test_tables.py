@@ -52,11 +52,17 @@ def test_stretches_are_left_out_and_gaps_are_bridged_up_to_a_length(table):
 def test_wrong_maps_are_named(table):
     for change, match in (
         ({"angles": ("phi",)}, "no column 'phi'"),
-        ({"chambers": ("a",)}, "needs 1 commands and 2 chambers"),
+        ({"chambers": ("a", "b", "u")}, "needs 1 differential pressures or 2 chambers"),
         ({"pressure_unit": "atm"}, "pressure_unit is 'atm'"),
     ):
         with pytest.raises(LogError, match=match):
             read_csv(table, ColumnMap(**{**COLUMNS, **change}))
+
+
+def test_pressures_may_be_logged_as_differences(table):
+    columns = ColumnMap(**{**COLUMNS, "chambers": ("u",), "rest_until": 0.0})
+    log = read_csv(table, columns)
+    np.testing.assert_allclose(log.measured_differential, log.commanded_differential)
 
 
 @pytest.mark.parametrize(

@@ -11,14 +11,13 @@ error of its gain, each with its standard deviation. Exit code 0: written; 2: a 
 from __future__ import annotations
 
 import argparse
-import dataclasses
 from pathlib import Path
 
 import numpy as np
 
 from der_planner.arrays import Array
-from der_planner.commands.learn import FAILURES, add_plan_options, check_same, plan_of
-from der_planner.control.hindsight import Filmed, Smoothed, smooth
+from der_planner.commands.learn import FAILURES, add_plan_options, filmed, plan_of
+from der_planner.control.hindsight import Smoothed, smooth
 from der_planner.experiment.console import check_file, command_parser, run_command
 from der_planner.planning import Plan
 from der_planner.results import EvaluationError, RunSeries, load_run
@@ -48,15 +47,6 @@ def _estimate(given: argparse.Namespace) -> int:
     return 0
 
 
-def filmed(planned: Plan, run: RunSeries) -> tuple[Plan, Filmed]:
-    """Return the plan as it was played, and what camera and board showed of the run."""
-    check_same(planned, run)
-    played = dataclasses.replace(planned, differential_pressure=run.setpoints.value)
-    return played, Filmed(
-        run.measured.time, run.measured.value, run.tip.time, run.bend_angle.value, run.tip.value
-    )
-
-
 def estimate_run(planned: Plan, run: RunSeries) -> Smoothed:
     """Return the smoothed motion of a recorded run.
 
@@ -77,7 +67,9 @@ def estimate_run(planned: Plan, run: RunSeries) -> Smoothed:
 def _said(smoothed: Smoothed, run: RunSeries) -> list[str]:
     """Return what there is to say of a run, a line each."""
     deviation = np.sqrt(np.trace(smoothed.tip_covariance, axis1=1, axis2=2).mean())
+    seen = run.tip.time[np.isfinite(run.tip.value).all(axis=1)]
     lines = [
+        f"seen from {seen[0]:.1f} to {seen[-1]:.1f} s of {smoothed.time[-1]:.1f} s",
         f"tip known to {deviation * 1000:.2f} mm (standard deviation)",
         f"pictures against what was expected of them: {smoothed.innovation:.2f} of the variance",
     ]

@@ -13,8 +13,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from der_planner.commands.estimate import filmed
-from der_planner.commands.learn import add_plan_options, plan_of
+from der_planner.commands.learn import add_plan_options, filmed, plan_of
 from der_planner.control.hindsight import touches
 from der_planner.experiment.console import (
     Progress,

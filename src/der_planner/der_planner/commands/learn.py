@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from der_planner.control import Learner, LearningError
+from der_planner.control.hindsight import Filmed, touches
 from der_planner.experiment.console import check_file, command_parser, run_command
 from der_planner.limb import Limb, LimbError
 from der_planner.planning import Motion, Obstacles, Plan, PlanningError, plan
@@ -54,6 +55,12 @@ def _learn(given: argparse.Namespace) -> int:
         last = learner.history[-1]
         said = f"mean error {last.mean_error * 100:.3f} cm; {last.reason}"
         print(f"{run.description.title}: {said}")
+        for touch in touches(*filmed(first, run)) if len(run.measured) else ():
+            print(
+                f"warning: something seems to touch the limb in it from {touch.since:.1f} s on "
+                f"({touch.said}): learn from runs that nothing touches",
+                file=sys.stderr,
+            )
     if not any(run.accepted for run in learner.history):
         print("error: no run was used, so nothing was learned", file=sys.stderr)
         return 1
@@ -134,6 +141,15 @@ def plan_of(run: RunSeries, given: argparse.Namespace) -> Plan:
     return plan(limb, motion, model=told.model, obstacles=in_the_way)
 
 
+def filmed(planned: Plan, run: RunSeries) -> tuple[Plan, Filmed]:
+    """Return the plan as it was played, and what camera and board showed of the run."""
+    check_same(planned, run)
+    played = dataclasses.replace(planned, differential_pressure=run.setpoints.value)
+    return played, Filmed(
+        run.measured.time, run.measured.value, run.tip.time, run.bend_angle.value, run.tip.value
+    )
+
+
 def check_same(planned: Plan, run: RunSeries) -> None:
     """Refuse a bag that holds another motion.
 
@@ -141,12 +157,13 @@ def check_same(planned: Plan, run: RunSeries) -> None:
         LearningError: its reference is not that of the plan.
     """
     wanted, asked = planned.tip_reference, run.reference.value
-    apart = np.inf
+    apart = f"{len(asked)} and {len(wanted)} setpoints"
     if wanted.shape == asked.shape:
-        apart = float(np.linalg.norm(wanted - asked, axis=1).max())
-    if apart > _SAME_POINT:
-        raise LearningError(
-            f"{run.description.title} holds another motion than the plan ({len(asked)} and "
-            f"{len(wanted)} setpoints, references up to {apart * 100:.1f} cm apart): give bags of "
-            "one motion, and the limb file and the --obstacles that it was planned with"
-        )
+        farthest = float(np.linalg.norm(wanted - asked, axis=1).max())
+        if farthest <= _SAME_POINT:
+            return
+        apart = f"references up to {farthest * 100:.1f} cm apart"
+    raise LearningError(
+        f"{run.description.title} holds another motion than the plan ({apart}): give bags of one "
+        "motion, and the limb file and the --obstacles that it was planned with"
+    )

@@ -321,6 +321,11 @@ def _describe(
     progress.say(f"limb: {limb.name}, {limb.segment_count} segments, {limb.length:.3f} m")
     progress.say(f"loads: {_loads(limb)}")
     progress.say(f"stage: {_stage(options)}")
+    if (in_the_way := options.in_the_way) is not None:
+        progress.say(f"in the way: {', '.join(map(str, in_the_way.items))}")
+    if options.feedback:
+        limit = f", up to {options.force_limit} N" if options.force_limit else ""
+        progress.say(f"what touches the limb under feedback: {options.reaction}{limit}")
     if options.hardware is not None:
         for name, values in vars(options.hardware).items():
             progress.say(f"  {name}: {values or 'as it is'}")

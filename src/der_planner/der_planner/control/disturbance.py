@@ -279,7 +279,7 @@ def chambers_beyond(
         measured: (n, M) differential pressures in the chambers then [Pa].
 
     Returns:
-        None where no reading was whole.
+        None where no whole readings are of the run; 0 outside of the first and last reading.
 
     Raises:
         LearningError: shapes that do not fit, or pressures that are not those of the run.
@@ -297,8 +297,11 @@ def chambers_beyond(
     order = np.argsort(instants[whole], kind="stable")
     instants, values = instants[whole][order], values[whole][order]
     middle = setpoints + 0.5 * (setpoints[1] - setpoints[0])
-    beyond = interpolate(middle, instants, values) - expected
-    missed, usual = (float(np.sqrt(np.mean(each**2))) for each in (beyond, expected))
+    told = (middle >= instants[0]) & (middle <= instants[-1])
+    if not told.any():
+        return None
+    beyond = np.where(told[:, None], interpolate(middle, instants, values) - expected, 0.0)
+    missed, usual = (float(np.sqrt(np.mean(each[told] ** 2))) for each in (beyond, expected))
     if missed > _NOT_THESE * usual:
         raise LearningError(
             f"the chambers are {missed:.0f} Pa away from the {usual:.0f} Pa that the commands make "

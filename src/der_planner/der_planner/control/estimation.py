@@ -139,15 +139,13 @@ class Estimator:
         settings, inputs = self.settings, self.inputs
         noise = np.diag(np.repeat([settings.bend_noise**2, settings.tip_noise**2], [inputs, 2]))
         given = noise if covariance is None else np.asarray(covariance, dtype=float)
-        if given.shape == (2, 2):
-            noise[inputs:, inputs:] = given
-            return noise
-        if given.shape != noise.shape:
+        if given.shape not in ((2, 2), noise.shape) or (np.diagonal(given) < 0.0).any():
             raise ValueError(
                 f"covariance must be that of the tip (2, 2) or of bend angles and tip "
-                f"{noise.shape}, got {given.shape}"
+                f"{noise.shape}, with variances that are not negative, got {given.tolist()}"
             )
-        return given
+        noise[-len(given) :, -len(given) :] = given
+        return noise
 
     # What goes out -------------------------------------------------------------------------
 

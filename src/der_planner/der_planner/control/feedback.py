@@ -38,8 +38,10 @@ _AUTHORITY = 0.4
 """Largest correction, as a share of the limb's pressure limit."""
 _SOON = 10
 """Coming commands that may be played before the next ones are known, and must keep off a touch."""
+_AHEAD = 10.0
+"""Instants so far beyond the newest command are of another clock, or in another unit [s]."""
 _LONGEST = 1e5
-"""Instants further from the first setpoint are of another clock, or in another unit [s]."""
+"""So are those further from the first setpoint [s]."""
 _FILLED = 0.1
 """Command from which on chambers must hold something, as a share of the limb's pressure limit."""
 
@@ -65,7 +67,8 @@ class Feedback:
         self.plan = plan
         authority = _AUTHORITY * plan.limb.pneumatics.pressure_limit
         if reaction == "yield" and not plan.limb.calibrated.differential_pressure:
-            reaction = "warn"
+            reaction, force_limit = "warn", None
+        self._newest = 0.0
         self._supervisor = Supervisor(authority)
         with _THREADS.limit(limits=1, user_api="blas"):
             self._nominal = Nominal(plan)
@@ -142,7 +145,7 @@ class Feedback:
         Raises:
             ValueError: another shape, or no time of the plan.
         """
-        _check(time)
+        self._check(time)
         values, limb = np.asarray(differential, dtype=float), self.plan.limb
         beyond = bool(impossible(limb, "pressures", values))
         changed = self._chambers.read(time, np.full_like(values, np.nan) if beyond else values)
@@ -169,9 +172,9 @@ class Feedback:
             covariance: of the tip (2, 2) [m²], or of bend angles and tip (M + 2, M + 2).
 
         Raises:
-            ValueError: another shape, or no time of the plan.
+            ValueError: another shape, or no time of the plan, or the covariance is none.
         """
-        _check(time)
+        self._check(time)
         self._estimator.measure(time, bend_angle, tip, covariance)
 
     def command(self, time: float) -> Array:
@@ -183,7 +186,8 @@ class Feedback:
         Raises:
             ValueError: no time of the plan.
         """
-        _check(time)
+        self._check(time)
+        self._newest = time
         k = round(time / CONTROL_PERIOD)
         instant = k * CONTROL_PERIOD
         supervisor = self._supervisor
@@ -242,25 +246,25 @@ class Feedback:
 
     def sent(self, time: float, command: ArrayLike) -> None:
         """Tell that another command (M,) [Pa] was sent for an instant [s] than was asked for."""
-        _check(time)
+        self._check(time)
         k = round(time / CONTROL_PERIOD)
         self._chambers.send(k, np.asarray(command, dtype=float))
         self._estimator.changed(k * CONTROL_PERIOD)
 
     def late(self, time: float, by: float) -> None:
         """Tell that the command of an instant [s] could not be sent in time, and how late [s]."""
-        _check(time)
+        self._check(time)
         self._supervisor.late(time, by)
 
     def estimate(self, time: float) -> Estimate:
         """Return the estimate of the limb at an instant [s], past or to come."""
-        _check(time)
+        self._check(time)
         with _THREADS.limit(limits=1, user_api="blas"):
             return self._estimator.estimate(time)
 
-
-def _check(time: float) -> None:
-    if not abs(time) < _LONGEST:
-        raise ValueError(
-            f"the instant {time:.6g} is none of the plan: give seconds since its first setpoint"
-        )
+    def _check(self, time: float) -> None:
+        if not abs(time) < _LONGEST or time > self._newest + _AHEAD:
+            raise ValueError(
+                f"the instant {time:.6g} is none of the plan, whose newest command is of "
+                f"{self._newest:.6g} s: give seconds since its first setpoint"
+            )

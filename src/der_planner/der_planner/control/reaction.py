@@ -51,8 +51,11 @@ class Reaction:
     def __init__(self, model: RodModel, kind: Kind = "yield", limit: float | None = None) -> None:
         if kind not in KINDS:
             raise ValueError(f"a reaction is one of {', '.join(KINDS)}, got {kind!r}")
-        if limit is not None and not (math.isfinite(limit) and limit >= 0.0):
-            raise ValueError(f"a limit of the force must be 0 N or more, got {limit}")
+        if limit is not None and not (math.isfinite(limit) and limit >= 0.0 and kind == "yield"):
+            raise ValueError(
+                f"a limit of the force must be 0 N or more, with the reaction yield, got {limit} "
+                f"with {kind}"
+            )
         self.kind, self.limit = kind, limit
         self._held: Array | None = None
         self._bound = np.zeros(model.inputs), 0.0

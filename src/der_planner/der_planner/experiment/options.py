@@ -307,7 +307,9 @@ def parse(arguments: Sequence[str]) -> Options:
         if value is not None and (within := each.metadata.get("within")):
             least, most = within
             if not least <= value <= most:
-                raise OptionError(f"--{each.name} is {value}: choose {least} to {most}")
+                raise OptionError(
+                    f"--{each.name.replace('_', '-')} is {value}: choose {least} to {most}"
+                )
     loads = Loads.given(given)
     motions = _motions(given)
     models = tuple(dict.fromkeys(given.models))
@@ -345,6 +347,14 @@ def parse(arguments: Sequence[str]) -> Options:
         (
             given.feedback and "der" not in models,
             "--feedback corrects plans of the rod: choose --models der",
+        ),
+        (
+            not given.feedback and (given.force_limit or given.reaction != "yield"),
+            "--reaction and --force-limit are about feedback: add --feedback",
+        ),
+        (
+            given.force_limit and given.reaction != "yield",
+            "--force-limit is what the reaction yield allows: leave --reaction out",
         ),
         (
             given.library is not None and not given.library.is_dir(),

@@ -69,6 +69,8 @@ SHORTEST_DELAY = 0.005
 STIFFER_STARTS = (0.0, 0.25, 0.5, 0.9)
 """Added to the logarithm of the stiffness, or taken off that of the mass, until the rod can follow
 the log from there."""
+FARTHEST_WEIGHT = 1.5
+"""Place of a known weight, over the prior's length, beyond which it is not in metres."""
 _NO_CUBIC = (
     "the cubic term is left out: with it the limb that fits the log best gives way under its "
     "pressures, since under gravity that term is hardly told from stiffness and rest angle"
@@ -108,6 +110,11 @@ def fit(
     if weight and ("dynamics" not in groups or "mass" in groups):
         raise LogError(
             "a known weight tells the stiffness: leave dynamics among the terms, and the mass out"
+        )
+    if weight and not 0.0 < weight[1] <= FARTHEST_WEIGHT * limb.length:
+        raise LogError(
+            f"the weight is said to hang at {weight[1]:g} m along a limb of {limb.length:.3g} m: "
+            "give metres from its clamp (--at), or the limb's lengths in the limb file of --prior"
         )
     found, report = _fit(limb, log, groups, longest_gap, weight)
     late, deviation = report.delay
@@ -183,6 +190,7 @@ def _fit(
         rows=int(prepared.usable.sum()),
         delay=fitted.problem.delay(fitted.values),
         warnings=tuple(warnings),
+        weight="" if hung is None else str(hung),
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from der_planner.arrays import Array
 from der_planner.limb import Limb
 from der_planner.limb.plausible import FEW, TOO_SMALL, impossible, outliers
-from der_planner.model import CONTROL_PERIOD
+from der_planner.model import CONTROL_PERIOD, RodModel
 
 LONGEST_GAP = 1.0
 """Gap in the tags that a straight line may bridge [s]; rows in longer ones are not fitted to."""
@@ -29,6 +30,8 @@ LEAST_DURATION = 1.0
 """Duration below which it must, too [s]."""
 LEAST_MOTION = np.deg2rad(3.0)
 """Range of motion from which on gains are judged [rad]."""
+ANOTHER_SIDE = math.radians(25.0)
+"""Direction of the tips beside that of the bend angles above which their axes differ [rad]."""
 LONGEST_SWING = 12.0
 """Longest time at the beginning of a log that is waited for a swing to end [s]."""
 
@@ -228,6 +231,7 @@ def prepare(
         _check_commands(grid)
         _check_excitation(pressure[valid & ~swinging])
         _check_match(pressure, bend, warnings)
+        _check_axes(grid, limb)
     if swinging.any():
         grid.bend_angles[swinging], grid.tip[swinging] = np.nan, np.nan
         warnings.append(
@@ -293,6 +297,20 @@ def _check_tips(log: CalibrationLog, limb: Limb) -> None:
             f"the tips are {far:.3g} m from the clamp, the limb '{limb.name}' is "
             f"{limb.length:.3g} m long: check the tips' unit (length_unit) and origin, which is "
             "the clamp, or give the limb's lengths in the limb file of --prior"
+        )
+
+
+def _check_axes(log: CalibrationLog, limb: Limb) -> None:
+    """Refuse tips that are elsewhere than the bend angles put them: swapped or turned axes."""
+    bent = RodModel(limb).kinematics.tip(log.bend_angles)
+    aside = np.arctan2(bent[:, 1], bent[:, 0]) - np.arctan2(log.tip[:, 1], log.tip[:, 0])
+    turned = np.abs(np.arctan2(np.sin(aside), np.cos(aside)))[np.isfinite(aside)]
+    apart = float(np.percentile(turned, 90)) if turned.size else 0.0
+    if apart > ANOTHER_SIDE:
+        raise LogError(
+            f"the tips are {math.degrees(apart):.0f}° aside, seen from the clamp, of where the "
+            "bend angles put them: x points along the straight limb, and y to the side to which "
+            "positive angles turn; check the order of the columns tip, and the angles' factor"
         )
 
 

@@ -93,7 +93,8 @@ class ColumnMap:
         time: column of the time.
         commanded: (M,) columns of commanded differential pressures, or (2M,) of commanded chamber
             pressures.
-        chambers: (2M,) columns of measured chamber pressures: 0, 1 of segment 0, then of segment 1.
+        chambers: (2M,) columns of measured chamber pressures: 0, 1 of segment 0, then of segment 1;
+            or (M,) of measured differential pressures.
         angles: (M,) columns of the segments' angles; left out where there are poses.
         tip: (2,) columns of x, y in `limb_base`; empty if there are none.
         tags: columns that repeat their last value, all of them, when a tag is lost; empty: never.
@@ -208,10 +209,11 @@ def read_csv(path: str | Path, columns: ColumnMap) -> CalibrationLog:
     """
     table = read_table(Path(path))
     count = len(columns.chambers) // 2 if columns.poses else len(columns.angles)
-    if len(columns.commanded) not in (count, 2 * count) or len(columns.chambers) != 2 * count:
+    given = len(columns.commanded), len(columns.chambers)
+    if not set(given) <= {count, 2 * count}:
         raise LogError(
-            f"the column map names {count} angles: it needs {count} commands and {2 * count} "
-            f"chambers, got {len(columns.commanded)} and {len(columns.chambers)}"
+            f"the column map names {count} angles: it needs {count} differential pressures or "
+            f"{2 * count} chambers as commands and as chambers, got {given[0]} and {given[1]}"
         )
 
     def pick(names: tuple[str, ...]) -> Array:
@@ -224,9 +226,10 @@ def read_csv(path: str | Path, columns: ColumnMap) -> CalibrationLog:
 
     pressure = columns.factor("pressure_unit")
     time = columns.factor("time_unit") * pick((columns.time,))[:, 0]
-    command, chambers = pressure * pick(columns.commanded), pressure * pick(columns.chambers)
-    if len(columns.commanded) == 2 * count:
-        command = command[:, 0::2] - command[:, 1::2]
+    command, measured = (
+        each if each.shape[1] == count else each[:, 0::2] - each[:, 1::2]
+        for each in (pressure * pick(columns.commanded), pressure * pick(columns.chambers))
+    )
     tip = np.full((len(time), 2), np.nan)
     if columns.poses:
         poses = read_poses(Path(columns.poses))
@@ -236,7 +239,6 @@ def read_csv(path: str | Path, columns: ColumnMap) -> CalibrationLog:
         angles = columns.factor("angle_unit") * columns.angle_factor * pick(columns.angles)
     if columns.tip:
         tip = columns.factor("length_unit") * pick(columns.tip)
-    measured = chambers[:, 0::2] - chambers[:, 1::2]
     if columns.rest_until != 0:
         rest = _rest(time, command, columns.rest_until)
         if not rest.any():

@@ -70,6 +70,7 @@ class FitReport:
         delay: by which what was seen is late, and its standard deviation [s].
         taken_out: the part of it that was taken off the stamps before the fit [s].
         warnings: sentences.
+        weight: sentence on the known weight in the log, if there is one.
     """
 
     limb: Limb
@@ -87,6 +88,7 @@ class FitReport:
     delay: tuple[float, float] = (math.nan, math.nan)
     taken_out: float = 0.0
     warnings: tuple[str, ...] = ()
+    weight: str = ""
 
     def value(self, name: str) -> Unknown:
         """Return the unknown of this name, e.g. ``gain[0]``.
@@ -122,6 +124,7 @@ class FitReport:
                 f"its range{other}"
             )
         lines += self._air_lines() + self._geometry_lines() + self._load_lines()
+        lines += filter(None, [self.weight])
         late, deviation = self.delay
         if late < -3.0 * deviation:
             lines.append(

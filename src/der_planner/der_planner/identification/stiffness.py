@@ -203,6 +203,7 @@ class HungWeight:
         bends: (2, M) bend angles before and under it [rad].
         pressures: (2, M) in the chambers at the same times [Pa].
         rows: (K,) rows of the log from when it may have been hung on.
+        time: from which on the limb stood still under it [s].
     """
 
     mass: float
@@ -210,6 +211,15 @@ class HungWeight:
     bends: Array
     pressures: Array
     rows: NDArray[np.bool_]
+    time: float
+
+    def __str__(self) -> str:
+        """Return what is known of it, for the report."""
+        bent = ", ".join(f"{angle:+.1f}°" for angle in np.degrees(self.bends[1] - self.bends[0]))
+        return (
+            f"weight: {1000 * self.mass:.3g} g at {1000 * self.at:.0f} mm bent the segments by "
+            f"{bent} and held them from {self.time:.1f} s on; their stiffness is by it"
+        )
 
     @classmethod
     def found(cls, log: Prepared, mass: float, at: float) -> HungWeight:
@@ -250,7 +260,8 @@ class HungWeight:
         rows = np.zeros(len(size), dtype=bool)
         rows[free:end] = True
         pressures = np.stack([log.pressure[first:free].mean(axis=0), log.pressure[under].mean(0)])
-        return cls(mass, at, np.stack([before, means[most]]), pressures, rows)
+        bends, held_from = np.stack([before, means[most]]), float(log.log.time[begins[most]])
+        return cls(mass, at, bends, pressures, rows, held_from)
 
     def stiffness_change(self, known: Limb, fitted: Limb) -> tuple[Array, Array]:
         """Return by how much stiffness differs from what was known, and how sure that is.
@@ -287,7 +298,7 @@ class HungWeight:
             side = math.copysign(GRAVITY, float((self.bends[1] - self.bends[0]).sum()))
             pulled = replace(limb, gravity=(0.0, side, 0.0))
         own, alone = _weights(limb, self.bends), _weights(pulled, self.bends)
-        together = _weights(pulled.carrying(self.mass, self.at), self.bends)
+        together = _weights(pulled.carrying(self.mass, self.at, name="known weight"), self.bends)
         torque: Array = (together - alone)[1] + own[1] - own[0]
         return torque
 

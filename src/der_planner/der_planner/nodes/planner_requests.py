@@ -68,7 +68,8 @@ class PlannerOptions:
 
     def corrected(self, planned: Plan) -> Feedback:
         """Return feedback on a plan, with the reaction to a touch that is set."""
-        return Feedback(planned, self.reaction, self.force_limit or None)
+        limit = self.force_limit if self.reaction == "yield" else 0.0
+        return Feedback(planned, self.reaction, limit or None)
 
     def as_now(self, node: Node) -> PlannerOptions:
         """Return the parameters with what may be changed while the node runs as it is now."""

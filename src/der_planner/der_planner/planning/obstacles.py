@@ -145,7 +145,8 @@ class Obstacles:
             content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
             return Obstacles.from_mapping(content)
         except (OSError, yaml.YAMLError, ValueError, TypeError, KeyError) as error:
-            raise PlanningError(f"{path} cannot be used as a file of obstacles: {error}") from error
+            said = getattr(error, "strerror", None) or error
+            raise PlanningError(f"{path} cannot be used as a file of obstacles: {said}") from error
 
     @staticmethod
     def from_mapping(content: Any) -> Obstacles:
