@@ -363,6 +363,10 @@ def test_yielding_presses_no_harder_than_the_plan(model, touch):
         assert touch.pressure @ (kept - planned) == pytest.approx(0.0, abs=1e-3)
     np.testing.assert_array_equal(reacted(reaction, less, CHAMBERS, touch, less), less)
     ended = untouched(2.0, touch.bend_angles)
+    # Friction may hide what is left of it.
+    suspected = replace(ended, suspected=True)
+    kept = reacted(reaction, harder, CHAMBERS, suspected, CHAMBERS)
+    assert touch.pressure @ (kept - CHAMBERS) == pytest.approx(0.0, abs=1e-3)
     np.testing.assert_array_equal(reacted(reaction, harder, CHAMBERS, ended, less), harder)
 
 
@@ -451,3 +455,5 @@ def test_what_is_no_reaction_is_refused(model):
         Reaction(model, "flee")
     with pytest.raises(ValueError, match="0 N or more"):
         Reaction(model, "yield", -1.0)
+    with pytest.raises(ValueError, match="with the reaction yield"):
+        Reaction(model, "hold", 0.5)

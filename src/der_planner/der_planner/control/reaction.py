@@ -8,8 +8,8 @@ seconds, in which corrections pressed twice as hard as the plan.
 A touch is worth an effective pressure ℓ per segment (`Touch.pressure`): bending further against it
 raises the force. A change δu of the pressures in the chambers does so as far as −ℓ·δu > 0. While
 something is touched, `yield` gives no command u with −ℓ·u above that of the plan: what is wanted is
-moved to the nearest command on that side. To retreat farther than the plan would do
-harm where a touch is false.
+moved to the nearest command on that side, until nothing is suspected any more. To retreat farther
+than the plan would do harm where a touch is false.
 
 With a limit in N the bound is where the force f, with its deviation, would reach it: a change
 −ℓ·δu is taken to raise the force by |f|/|ℓ|² of it. Until the force can be told, pressures stay
@@ -83,7 +83,10 @@ class Reaction:
         harder, bound = self._bound
         self._suspected = touch.suspected and self.acts
         if not (touch.touched and self.acts):
-            if self.limit is None or not (self.kind == "yield" and harder @ planned > bound):
+            yields = self.kind == "yield" and self._held is not None
+            if yields and self.limit is None and touch.suspected:
+                self._bound = harder, float(harder @ planned)
+            elif not (yields and self.limit is not None and harder @ planned > bound):
                 self._held = None
             return
         begins = self._held is None
