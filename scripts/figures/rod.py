@@ -21,7 +21,7 @@ from workspace_setup.basics import ROOT
 matplotlib.use("Agg")
 
 FOLDER = ROOT / "docs" / "pictures"
-ELASTICA_TIP_MM = 66.3753  # exact inextensible elastica, see test_statics
+ELASTICA_TIP_MM = 66.3753  # exact inextensible elastica: examples/cantilever.py
 
 
 def save(figure: plt.Figure, folder: Path, name: str) -> None:

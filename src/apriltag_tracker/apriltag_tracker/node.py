@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import array
-import sys
 import time
 from dataclasses import replace
 
@@ -266,7 +265,3 @@ def _tag_message(placed: PlacedTag) -> TagDetection:
 def main() -> int:
     """Run the node."""
     return run_node(TrackerNode)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

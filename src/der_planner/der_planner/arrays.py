@@ -20,3 +20,8 @@ def interpolate(instants: Numbers, time: Numbers, values: Array) -> Array:
         values: (K, M) samples.
     """
     return np.stack([np.interp(instants, time, column) for column in values.T], axis=1)
+
+
+def rms_distance(difference: Array) -> float:
+    """Return the root mean square of the lengths of K vectors (K, N)."""
+    return float(np.sqrt(np.mean(np.sum(difference**2, axis=1))))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import sys
 import time
 from typing import Any
 
@@ -119,7 +118,3 @@ class PoseTrackerNode(LimbStateNode):
 def main() -> int:
     """Run the node."""
     return run_node(PoseTrackerNode)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

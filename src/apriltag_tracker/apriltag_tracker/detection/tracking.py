@@ -35,7 +35,6 @@ FULL_SEARCH_PERIOD = 1.0
 class TrackingCounts:
     """How often what happened since the start."""
 
-    frames: int = 0
     full_searches: int = 0
     tracked: int = 0
     by_full_search: int = 0
@@ -135,7 +134,6 @@ class TagTracker:
         Returns:
             Tags of the map, each id once.
         """
-        self.counts.frames += 1
         self._postponed = None
         if any(not 0.0 < stamp - track.stamp <= _LONGEST_GAP for track in self._tracks.values()):
             self.reset()

@@ -94,7 +94,7 @@ def _main(given: argparse.Namespace) -> int:
     hardware = Hardware(**content)
     if given.hardware:
         hardware = Hardware.from_yaml(given.hardware)
-        content = yaml.safe_load(given.hardware.read_text())
+        content = yaml.safe_load(given.hardware.read_text(encoding="utf-8"))
     if not 500.0 <= given.pressure <= 20_000.0:
         raise OptionError(f"--pressure is {given.pressure:g} Pa: choose 500 to 20000")
     if given.out is not None:
@@ -121,7 +121,8 @@ def _main(given: argparse.Namespace) -> int:
         given.out.parent.mkdir(parents=True, exist_ok=True)
         if clamp is not None and is_off(clamp):
             _move_base(content, map_path, clamp, given.out)
-        given.out.write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True))
+        text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
+        given.out.write_text(text, encoding="utf-8")
         print(f"rig file: {given.out}")
     return 0
 

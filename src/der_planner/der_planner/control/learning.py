@@ -77,8 +77,8 @@ class LearningRun:
 
     Attributes:
         number: of the run, from 1.
-        mean_error, largest_error: distance of the measured tip from r̄ at the camera's instants,
-            where it was seen [m].
+        mean_error: distance of the measured tip from r̄ at the camera's instants, where it was
+            seen [m].
         seen: share of the setpoints at which the tip was seen.
         accepted: the run was used.
         step: α of the plan that follows it.
@@ -89,7 +89,6 @@ class LearningRun:
 
     number: int
     mean_error: float
-    largest_error: float
     seen: float
     accepted: bool
     step: float
@@ -178,9 +177,8 @@ class Learner:
         accepted, said = (False, refusal) if refusal else self._accept(played)
         if accepted and beyond is not None:
             self._beyond = beyond
-        number, mean, largest = len(self.history) + 1, float(missed.mean()), float(missed.max())
-        repeats = self.repeatability
-        run = LearningRun(number, mean, largest, seen, accepted, self._step, repeats, said)
+        number, mean, repeats = len(self.history) + 1, float(missed.mean()), self.repeatability
+        run = LearningRun(number, mean, seen, accepted, self._step, repeats, said)
         self.history.append(run)
 
     def next(self) -> Plan:

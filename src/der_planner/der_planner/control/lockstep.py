@@ -1,8 +1,8 @@
 """A plan played on a simulated limb in one process, with sensors, latency and feedback.
 
 Simulated time is the only clock: the same plan, limb and seed give the same run, however busy the
-machine is. What is asked of feedback is what the graph asks: a command is asked for a lead before
-its instant, of a state that a camera shows some ten milliseconds late.
+machine is. Feedback is asked as on the graph: for each command some time before its instant, while
+pictures arrive some ten milliseconds late.
 """
 
 from __future__ import annotations

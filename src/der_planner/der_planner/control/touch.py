@@ -54,10 +54,10 @@ _SUSPECTED = 0.15
 """Share of the threshold from which on something may touch that friction hides: corrections do not
 grow then."""
 _LEARNED_AFTER = 0.4
-"""What is over within that time is learned, touch or not: contact that begins slowly is not [s]."""
+"""An instant is learned as free only so long after it [s]: not if a touch is noticed meanwhile."""
 _TOUCHED_FORGETS = 0.1
-"""Share of time that counts for forgetting the free level while something touches the limb: a touch
-ends when the limb is back there."""
+"""During a touch the free level is forgotten at this share of the usual speed, so that the end of
+the touch can be told."""
 _EARLIER = 4
 """Number of touches whose free levels are kept."""
 _LONGEST = 1.0
@@ -75,8 +75,8 @@ _UNEVEN = 0.02
 _AT_ONCE = 0.5
 """Time over which what is lacking and pressures are compared when a touch is noticed [s]."""
 _FASTER = 1.3
-"""What a payload changes in that time, over what pressures do: something fixed presses no faster
-than the limb is driven against it."""
+"""A payload changes what is lacking so many times faster than pressures do. Something fixed
+cannot: it presses no faster than the limb is driven against it."""
 _CAME = 0.3
 """Time in which a payload has come once it is noticed [s]."""
 _WEIGHED = 0.7
@@ -185,7 +185,7 @@ class TouchSense:
         goes_on = self._rate * self._slid > 0.0
         self._slid = np.where(goes_on, self._slid, 0.0) + passed * rate
         lacking = Lacking.of(time, self._model.limb, known, bend, self._rate, self._slid)
-        # What was in doubt is so for as long as the estimator takes to follow.
+        # A doubt fades no faster than the estimator follows.
         kept = np.exp(-passed / _FOLLOWS)
         least, most = lacking.stuck
         self._stuck = np.stack(
@@ -289,10 +289,10 @@ class TouchSense:
         return max(distance, float(whole)) > _RELEASED * _SUSPECTED
 
     def _lets_go(self, lacking: Lacking, variance: Array) -> bool:
-        """Return whether what seems to touch is the end of something; go back to its free level.
+        """Return whether an earlier free level explains the limb better, and go back to that.
 
-        What was left of a force has been learned meanwhile, or a payload is taken off. The noise is
-        today's: a level of which little was known would explain any touch.
+        A force that had been learned has ended, or a payload is off. The noise is that of the
+        newest level: one of which little is known would explain any touch.
 
         Args:
             lacking: of the model.

@@ -11,7 +11,6 @@ import secrets
 import signal
 import socket
 import subprocess
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -99,7 +98,7 @@ class Hardware:
             OptionError: the file cannot be read, has unknown keys or no serial port.
         """
         try:
-            content = yaml.safe_load(path.read_text())
+            content = yaml.safe_load(path.read_text(encoding="utf-8"))
         except (OSError, yaml.YAMLError) as error:
             raise OptionError(f"cannot read hardware file {path}: {error}") from error
         known = [item.name for item in dataclasses.fields(cls) if item.name != "hosts"]
@@ -312,11 +311,9 @@ class NodeProcess:
         name: str = "",
     ) -> None:
         self.name = name or executable
-        self.executable = executable
         self.log = folder / f"{self.name}.log"
         self.cpu_seconds = 0.0
         """User and system time that the process had used when it was last looked at [s]."""
-        self._started = time.monotonic()
         folder.mkdir(parents=True, exist_ok=True)
         parameter_file = folder / f"{self.name}.yaml"
         parameter_file.write_text(

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from der_planner.arrays import Array
+from der_planner.arrays import Array, rms_distance
 from der_planner.identification.bends import CORRELATION, Predicted, follow
 from der_planner.identification.least_squares import (
     LeastSquares,
@@ -112,8 +112,8 @@ def fit_geometry(
     return GeometryFit(
         limb=found,
         uncertainty=np.sqrt(np.diag(search.covariance(best))),
-        residual_before=_distance(difference(limb)),
-        residual=_distance(difference(found)),
+        residual_before=rms_distance(difference(limb)),
+        residual=rms_distance(difference(found)),
     )
 
 
@@ -274,7 +274,3 @@ def _joints(limb: Limb) -> Array:
     for index, segment in enumerate(limb.segments):
         pieces += [limb.connector_length if index else 0.0, segment.length]
     return np.cumsum(pieces)
-
-
-def _distance(difference: Array) -> float:
-    return float(np.sqrt(np.mean(np.sum(difference**2, axis=1))))

@@ -38,8 +38,6 @@ REST_SHARE = 0.02
 """Share of a table's largest command below which commands count as rest."""
 VENTING_TIME = 5.0
 """Time that chambers need to be at rest after they were filled [s]."""
-TABLES = (".csv", ".tsv")
-"""Endings of the names of tables; what ends otherwise is a bag."""
 SEPARATORS = "\t;,"
 """Separators of columns; a table has the first of these that its header holds."""
 
@@ -134,7 +132,7 @@ class ColumnMap:
             LogError: the file cannot be read, or a key is unknown, missing or of another kind.
         """
         try:
-            content = yaml.safe_load(Path(path).read_text())
+            content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
         except (OSError, yaml.YAMLError) as error:
             raise LogError(f"cannot read the column map {path}: {error}") from error
         if not isinstance(content, Mapping):
@@ -272,7 +270,7 @@ def read_log(path: Path, columns: Path | None, namespace: str = "") -> Calibrati
     Raises:
         LogError: it cannot be read, or is a table without a map.
     """
-    if path.suffix not in TABLES and (columns is None or is_ours(path)):
+    if is_bag(path) and (columns is None or is_ours(path)):
         return read_bag(path, namespace)
     if columns is None:
         raise LogError(f"{path} needs --columns FILE")

@@ -16,8 +16,8 @@ from der_planner.limb import Term
 Mask = NDArray[np.bool_]
 
 UNTOLD = 0.8
-"""Share of its prior spread above which the deviation of an unknown means that the log does not
-tell it."""
+"""If the fit leaves an unknown more than this share of its prior deviation, the log does not tell
+it."""
 STIFFNESS_ERROR = 0.05
 """Least deviation of the logarithm of a stiffness: no model's friction is that of the limb."""
 ANOTHER_STIFFNESS = 3.0, math.log(1.5)
@@ -91,7 +91,7 @@ def kept_unknowns(free: FreeTerms) -> Iterator[Unknown]:
 def at_bounds(free: FreeTerms, values: Array) -> Iterator[str]:
     """Yield a sentence for each unknown at the end of its range.
 
-    What is just not there has none, nor friction that turns round at once, as on most limbs.
+    A term that is zero has none, nor friction that turns round at once, as on most limbs.
     """
     ends = free.unknowns.at_bound(values)
     for term, (segment, _), value, at_end in zip(

@@ -23,14 +23,12 @@ class Compliance:
     """First-order changes of a limb at rest, by a force (2,) at each of P places and by pressures.
 
     Attributes:
-        places: (P,) along the limb from its clamp [m].
         bend: (P, M, 2) of the bend angles by force [rad/N].
         tip: (P, 2, 2) of the tip by force [m/N].
         place: (P, 2, 2) of the place itself by force [m/N].
         bend_by_pressure: (M, M) by effective pressure [rad/Pa].
     """
 
-    places: Array
     bend: Array
     tip: Array
     place: Array
@@ -65,7 +63,6 @@ def compliance(model: RodModel, bend_angles: ArrayLike, places: ArrayLike) -> Co
     before = (np.arange(len(joints)) <= ends[:, None]).astype(float)
     share = np.diff(before, axis=0, prepend=0.0)
     return Compliance(
-        at,
         np.einsum("mj,pjf->pmf", share, turns),
         np.einsum("ja,pjf->paf", tip_sweep, turns),
         np.einsum("pja,pjf->paf", sweep, turns),

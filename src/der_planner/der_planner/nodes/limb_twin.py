@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import math
-import sys
 import threading
 import time
 from typing import Any
@@ -219,6 +218,6 @@ class LimbTwinNode(Node):
         return Health("ok", "keeps real time", values)
 
 
-def main() -> None:
-    """Entry point."""
-    sys.exit(run_node(LimbTwinNode))
+def main() -> int:
+    """Run the node."""
+    return run_node(LimbTwinNode)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import queue
-import sys
 import threading
 import time as clock
 from typing import Any
@@ -399,6 +398,6 @@ class PlannerNode(Node):
         self._work.put(None)
 
 
-def main() -> None:
-    """Entry point of `ros2 run der_planner planner`."""
-    sys.exit(run_node(PlannerNode))
+def main() -> int:
+    """Run the node."""
+    return run_node(PlannerNode)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import json
 import re
-import sys
 import time
 from dataclasses import dataclass, replace
 from functools import partial
@@ -390,6 +389,6 @@ def _profile(spec: TopicSpec) -> QoSProfile:
     )
 
 
-def main() -> None:
+def main() -> int:
     """Run the node."""
-    sys.exit(run_node(Recorder))
+    return run_node(Recorder)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -321,11 +320,7 @@ def create_executor() -> Executor:
     return EventsExecutor()
 
 
-def main() -> None:
-    """Entry point of `ros2 run der_planner page`."""
+def main() -> int:
+    """Run the node."""
     cv2.setNumThreads(1)
-    sys.exit(run_node(PageNode, create_executor=create_executor))
-
-
-if __name__ == "__main__":
-    main()
+    return run_node(PageNode, create_executor=create_executor)

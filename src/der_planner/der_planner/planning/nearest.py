@@ -200,7 +200,7 @@ class _Search:
     """Finds the bend angles (K, M) whose tips are nearest to (K, 2) targets, `step` [s] apart."""
 
     def __init__(self, workspace: Workspace, target: Array, step: float) -> None:
-        self._workspace, self._kinematics = workspace, workspace.arcs
+        self._kinematics = workspace.arcs
         self._target, self._step, self._count = target, step, workspace.limb.segment_count
         middle = (workspace.low + workspace.high) / 2
         half = (workspace.high - workspace.low) / 2 * (1 - RESERVE)

@@ -26,7 +26,7 @@ import numpy as np
 import piqp
 from scipy.linalg import cho_factor, cho_solve
 
-from der_planner.arrays import Array
+from der_planner.arrays import Array, rms_distance
 from der_planner.model import CONTROL_PERIOD, STEPS, Initial, State
 from der_planner.model.air import Air
 from der_planner.model.commands import within_limits
@@ -170,7 +170,7 @@ class Optimiser:
         cost, misses, window = self._evaluate(command, state, first, last)
         before = command[first - 1] if first else self.before
         for step in range(settings.iterations):
-            rms = _rms(misses)
+            rms = rms_distance(misses)
             if rms < settings.tolerance:
                 return step, met
             if jacobian is None:
@@ -190,7 +190,7 @@ class Optimiser:
             if new[0] > cost:
                 damping, jacobian = max(10 * damping, 1e-7), None
                 continue
-            gained = rms - _rms(new[1])
+            gained = rms - rms_distance(new[1])
             command[:last] = trial
             cost, misses, window = new
             if gained < max(settings.tolerance / 5, 0.02 * rms):
@@ -255,10 +255,6 @@ class Optimiser:
         weights = self._weights(size)[:, 2:]
         pull = weights.T @ weights + damping**2 * np.eye(size)
         return J, J.T @ J + np.kron(pull, np.eye(inputs))
-
-
-def _rms(misses: Array) -> float:
-    return float(np.sqrt(np.mean((misses**2).sum(axis=1))))
 
 
 # Quadratic programmes --------------------------------------------------------------------------

@@ -157,7 +157,7 @@ def draw_shape(
     amplitude: float,
     period: float,
     cycles: int,
-    from_bend: Array | None = None,
+    from_bend: Array,
 ) -> TipPath:
     """Return a shape as a timed path around the tip of a limb bent by 1.2 times the amplitude.
 
@@ -170,11 +170,9 @@ def draw_shape(
         amplitude: bend angle that sets place and size [rad].
         period: of one cycle [s].
         cycles: how many.
-        from_bend: (M,) bend angles from which the amplitude counts [rad]; None: straight.
+        from_bend: (M,) bend angles from which the amplitude counts [rad].
     """
-    bend = np.full(kinematics.segment_count, 1.2 * amplitude)
-    if from_bend is not None:
-        bend = bend + from_bend
+    bend = from_bend + 1.2 * amplitude
     centre = kinematics.tip(bend)
     length = float(kinematics.tip(np.zeros(kinematics.segment_count))[0])
     radius = SHAPE_SIZE * length * amplitude / (np.pi / 4)
@@ -206,9 +204,8 @@ def _faded_phase(turns: Array, cycles: int) -> Array:
         t = np.clip(x / fade, 0.0, 1.0)
         return fade * (2.5 * t**4 - 3 * t**5 + t**6)
 
-    start = np.where(turns < fade, ramp(turns), fade / 2 + (turns - fade))
-    end = fade / 2 + (total - fade - fade) + fade / 2 - ramp(total - turns)
-    return np.where(turns > total - fade, end, start)
+    begun = ramp(turns) + np.maximum(turns - fade, 0.0)
+    return np.where(turns > total - fade, cycles - ramp(total - turns), begun)
 
 
 def _corners(name: str) -> list[tuple[float, float]]:

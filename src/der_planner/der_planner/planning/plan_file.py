@@ -150,7 +150,8 @@ def write_plan(plan: Plan, path: str | Path, about: Mapping[str, Any] | None = N
         content["chambers_beyond_pa"] = plan.chambers_beyond.tolist()
     unfinished = file.with_name(f".{file.name}.part")
     text = "# A plan, in SI units; row by row the setpoints, 50 ms apart.\n"
-    unfinished.write_text(text + yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
+    text += yaml.safe_dump(content, sort_keys=False, default_flow_style=None)
+    unfinished.write_text(text, encoding="utf-8")
     os.replace(unfinished, file)
 
 

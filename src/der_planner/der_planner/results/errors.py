@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
-from der_planner.arrays import Array
+from der_planner.arrays import Array, rms_distance
 from der_planner.bags.run import BoardLog, EvaluationError, RunSeries, Stream
 
 LARGEST_LAG = 1.0
@@ -163,20 +163,16 @@ def split_error(run: RunSeries, settings: EvaluationSettings | None = None) -> S
         gain_y=float(gains[1]),
         bias_x_m=float(offset[0]),
         bias_y_m=float(offset[1]),
-        rms_without_lag_m=_rms(measured - late),
-        rms_without_bias_m=_rms(measured - late - offset),
-        rms_without_gain_m=_rms(measured - fitted),
+        rms_without_lag_m=rms_distance(measured - late),
+        rms_without_bias_m=rms_distance(measured - late - offset),
+        rms_without_gain_m=rms_distance(measured - fitted),
     )
-
-
-def _rms(difference: Array) -> float:
-    return float(np.sqrt(np.mean(np.sum(difference**2, axis=1))))
 
 
 def _best_lag(reference: Stream, time: Array, measured: Array, margin: float) -> float:
     def cost(lag: float) -> float:
         _, fitted = _fit_gains(interpolate(reference, time - lag), measured)
-        return _rms(measured - fitted)
+        return rms_distance(measured - fitted)
 
     if np.ptp(reference.value, axis=0).max() < STANDSTILL:
         return 0.0

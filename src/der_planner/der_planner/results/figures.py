@@ -1,4 +1,4 @@
-"""Figures of runs in one  Drawn without a display and without pyplot's global state.
+"""Figures of runs in one style. They are drawn without a display, by no global state of pyplot.
 
 The style is that of a two-column paper; its colours are told apart by colour-blind readers.
 """

@@ -43,11 +43,6 @@ class RodState:
         """(N, 3) node positions [m]."""
         return positions_of(self.q)
 
-    @property
-    def angles(self) -> Array:
-        """(N-1,) edge angles φ [rad]."""
-        return self.q[3::4].copy()
-
 
 def positions_of(q: Array) -> Array:
     """Return the (…, N, 3) node positions of (…, 4N-1) configurations."""
@@ -285,17 +280,6 @@ class Backend(ABC):
     @abstractmethod
     def input_matrix(self, state: RodState) -> Array:
         """Return B(q)Λ (4N-1, M)."""
-
-
-def band_to_dense(band: Array) -> Array:
-    """Return the full matrix of a symmetric band stored by columns."""
-    size, width = band.shape
-    result = np.diag(band[:, 0].copy())
-    for k in range(1, width):
-        rows = np.arange(k, size)
-        result[rows, rows - k] = band[: size - k, k]
-        result[rows - k, rows] = band[: size - k, k]
-    return result
 
 
 def general_band_to_dense(band: Array) -> Array:

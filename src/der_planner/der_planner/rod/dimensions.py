@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from der_planner.arrays import Array
-from der_planner.rod.backend import Backend, RodState, StepKernels, band_to_dense
+from der_planner.rod.backend import Backend, RodState, StepKernels, general_band_to_dense
+from der_planner.rod.banded_kernel import expand
 from der_planner.rod.mesh import Mesh
 from der_planner.rod.planar import elastic_kernel as planar_elastic
 from der_planner.rod.planar import step_kernel as planar_step
@@ -74,7 +75,8 @@ class PlanarBackend(Backend):
         planar_elastic.assemble(
             self.unknowns(state.q), still, 0.0, u, False, gradient, space, self.rod
         )
-        return self.full(gradient), self.full_matrix(band_to_dense(space.s))
+        expand(space.s, space.a)
+        return self.full(gradient), self.full_matrix(general_band_to_dense(space.a))
 
     def input_matrix(self, state: RodState) -> Array:
         """Return B(q)Λ (4N-1, M)."""
@@ -153,7 +155,8 @@ class SpatialBackend(Backend):
         gradient, still = np.zeros((2, self.size))
         u = np.zeros(len(self.mesh.gain))
         spatial_assembly.assemble(x, still, 0.0, u, False, gradient, space, self.rod)
-        return self.full(gradient), self.full_matrix(band_to_dense(space.s))
+        expand(space.s, space.a)
+        return self.full(gradient), self.full_matrix(general_band_to_dense(space.a))
 
     def input_matrix(self, state: RodState) -> Array:
         """Return B(q)Λ (4N-1, M)."""

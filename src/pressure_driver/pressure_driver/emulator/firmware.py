@@ -97,9 +97,7 @@ class CtrlpBoard(BoardProtocol):
     def __init__(self, chamber_count: int = 4) -> None:
         super().__init__(chamber_count)
         self._lines = LineSplitter()
-        self._reports = False
-        self._unit = "psi"
-        self._setpoint = (0.0,) * chamber_count
+        self.boot(0.0)
 
     def boot(self, atmosphere: float) -> bytes:  # noqa: ARG002 - it measures gauge pressure
         """Reports are off until asked for, and pressures are in psi."""

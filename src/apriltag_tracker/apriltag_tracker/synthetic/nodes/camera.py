@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import array
-import sys
 import time
 from pathlib import Path
 
@@ -136,7 +135,3 @@ class SyntheticCameraNode(ShapeListener):
 def main() -> int:
     """Run the node."""
     return run_node(SyntheticCameraNode)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

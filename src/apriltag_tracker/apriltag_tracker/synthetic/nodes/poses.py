@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -84,7 +83,3 @@ def _pose(position: np.ndarray, quaternion: np.ndarray) -> Pose:
 def main() -> int:
     """Run the node."""
     return run_node(SyntheticPosesNode)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
