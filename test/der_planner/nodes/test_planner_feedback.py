@@ -47,6 +47,43 @@ def test_a_plan_from_rest_begins_with_what_the_one_before_has_told():
     second.take_over.assert_not_called()
 
 
+def test_a_reaction_holds_however_late_corrections_are():
+    from unittest.mock import Mock
+
+    from der_planner.nodes.planner_feedback import _Corrected
+
+    held, schedule = np.array([9e3, 7e3]), Mock()
+    schedule.plan.differential_pressure = np.full((100, 2), 13e3)
+    schedule.plan.limb.pneumatics.pressure_limit = 24e3
+    feedback = Mock(allowed=lambda _: held)
+    feedback.coming.return_value = (5, np.full((10, 2), -4e3))
+    corrected = _Corrected(schedule, feedback, None, None)
+    for index in (3, 6, 60):  # before the newest solution, in it, and long after it
+        np.testing.assert_array_equal(corrected.pressures(index), held)
+
+
+def test_the_end_of_a_motion_ends_its_touch_and_says_why_it_vented():
+    from dataclasses import replace
+    from unittest.mock import Mock
+
+    from der_planner.control.touch import untouched
+    from der_planner.nodes.planner_feedback import Corrector
+
+    output, schedule, feedback = Mock(), Mock(), Mock()
+    feedback.touch = replace(untouched(3.0, np.zeros(2)), touched=True, said="0.21 N")
+    corrector = Corrector(output, Mock(), lambda: 0, Mock())
+    corrector.follow(schedule, feedback)
+    each = corrector._open[-1]
+    each.touching = each.vented = True
+    said = corrector.forget(schedule)
+    assert "the reaction is to vent): 0.21 N" in said
+    ((_, told),) = [call.args for call in output.contact.call_args_list]
+    assert not told.touched
+    assert "the motion has ended" in told.said
+    assert corrector.forget(schedule) == ""
+    corrector.close()
+
+
 def test_a_touch_is_published_and_drawn_while_it_lasts():
     from dataclasses import replace
     from unittest.mock import Mock

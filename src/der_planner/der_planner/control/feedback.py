@@ -231,6 +231,10 @@ class Feedback:
         if np.isfinite(time) and time > self._sense.newest.time:
             self._sense.feel(time, self._nominal, self._estimator.at(time))
 
+    def allowed(self, command: Array) -> Array:
+        """Return the command (M,) [Pa] that the reaction to a touch makes of one; any thread."""
+        return self._reaction.allowed(command)
+
     def coming(self) -> tuple[int, Array]:
         """Return the control period of the newest command, and corrections (W, M) [Pa] from it on.
 

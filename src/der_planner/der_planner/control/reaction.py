@@ -116,11 +116,12 @@ class Reaction:
         return self._newest
 
     def allowed(self, wanted: Array) -> Array:
-        """Return the command (M,) [Pa] in place of a wanted one."""
-        if self._held is None:
+        """Return the command (M,) [Pa] in place of a wanted one; from any thread."""
+        held = self._held
+        if held is None:
             return wanted
         if self.kind != "yield":
-            return self._held
+            return held
         harder, bound = self._bound
         square = max(float(harder @ harder), _SMALLEST**2)
         return wanted - harder * (max(0.0, float(harder @ wanted) - bound) / square)

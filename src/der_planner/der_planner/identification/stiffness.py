@@ -26,8 +26,9 @@ friction, which has turned against the motion. Friction is known as a bend angle
 that EI = τ L / (s(φ₁) − s(φ₀) + b). Before the weight, friction may hold the limb either way: b is
 known to b / √3.
 
-A limb that hangs, stands or leaves a wall is pulled along its gravity. One that lies on a plate is
-pulled sideways, by a thread that leaves it across the straight limb and runs over a pulley.
+A limb that leaves a wall, or hangs at an angle, is pulled along its gravity. One that lies on a
+plate is pulled sideways, by a thread that leaves it across the straight limb and runs over a
+pulley.
 """
 
 from __future__ import annotations
@@ -254,7 +255,8 @@ class HungWeight:
             raise LogError(
                 f"in the rest at {log.log.time[first]:.0f} s of the log nothing bends a segment by "
                 f"{math.degrees(LEAST_BEND):.0f}° and holds it for {HELD:.0f} s: hang on a heavier "
-                "weight, or nearer to the tip, once the limb has come to rest"
+                "weight, or nearer to the tip, once the limb has come to rest; a limb that hangs "
+                "straight is hardly bent by it. Without --weight and --at the log is fitted as is"
             )
         under = slice(begins[most], begins[most] + window)
         rows = np.zeros(len(size), dtype=bool)

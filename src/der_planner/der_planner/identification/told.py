@@ -77,7 +77,8 @@ def against_motion(unknowns: Sequence[Unknown], weighed: Array, doubt: Array) ->
             yield (
                 f"by the weight {each.name.removeprefix('log_')} is {math.exp(apart):.2f} times "
                 "what the limb's motion tells: check the weight's mass (--weight) and place "
-                "(--at), and that nothing else touched the limb"
+                "(--at), and that nothing else touched the limb. If they are right, friction "
+                "misled the motion, more so in a quick run, and the weight is to be believed"
             )
 
 

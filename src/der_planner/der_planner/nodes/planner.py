@@ -344,6 +344,7 @@ class PlannerNode(Node):
 
     def _ended(self, schedule: Schedule, outcome: str, reason: str) -> None:
         """Log how the playing of a plan ended, and tell who asked for it."""
+        reason = "; ".join(filter(None, [self._corrector.forget(schedule), reason]))
         text = f"plan {schedule.plan_id} {outcome} after {self._streamer.share(schedule)}"
         if outcome in ("vented", "fault", "lost"):
             # The driver takes nothing: plan nothing to go on with either.
@@ -355,7 +356,6 @@ class PlannerNode(Node):
             self.get_logger().info(f"{text}: {reason}" if reason else text)
             if outcome == "finished" and self._status[:2] == ("streaming", schedule.plan_id):
                 self._status = Status("done", schedule.plan_id)
-        self._corrector.forget(schedule)
         self._action.end(schedule.plan_id, outcome, reason)
 
     def _now(self) -> int:

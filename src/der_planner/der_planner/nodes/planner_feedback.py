@@ -12,6 +12,7 @@ import threading
 import time as clock
 from collections import deque
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from std_srvs.srv import Trigger
@@ -19,6 +20,7 @@ from std_srvs.srv import Trigger
 from der_msgs.msg import LimbState, PressureState
 from der_planner.arrays import Array
 from der_planner.control.feedback import Feedback
+from der_planner.control.touch import untouched
 from der_planner.limb import Limb
 from der_planner.nodes.planner_topics import PlannerPublishers
 from der_planner.planning import METHODS, Motion, plan
@@ -96,10 +98,14 @@ class _Corrected:
             item(receiver)
 
     def pressures(self, index: int) -> Array:
-        """Return the pressures (M,) [Pa] of a setpoint with the newest correction for it."""
+        """Return the pressures (M,) [Pa] of a setpoint with the newest correction for it.
+
+        However old that is, a reaction to a touch holds.
+        """
         planned = self.schedule.plan.differential_pressure[index]
         limit = self.schedule.plan.limb.pneumatics.pressure_limit
-        return np.clip(planned + self._correction(index), -limit, limit)
+        wanted = self.feedback.allowed(planned + self._correction(index))
+        return np.clip(wanted, -limit, limit)
 
     def _correction(self, index: int) -> Array:
         if self._left is not None:
@@ -156,10 +162,20 @@ class Corrector:
             self._last = feedback
             self._wake.notify_all()
 
-    def forget(self, schedule: Schedule) -> None:
-        """Correct a schedule no more."""
+    def forget(self, schedule: Schedule) -> str:
+        """Correct a schedule no more; return why feedback had the limb vented, if it had."""
         with self._wake:
+            ended = [each for each in self._open if each.schedule is schedule]
             self._open = [each for each in self._open if each.schedule is not schedule]
+        for each in ended:
+            touch = each.feedback.touch
+            if each.touching:
+                over = untouched(touch.time, touch.bend_angles)
+                said = "the motion has ended: touch is felt in motions with feedback alone"
+                self._output.contact(schedule, replace(over, said=said))
+            if each.vented:
+                return f"something touched the limb (the reaction is to vent): {touch.said}"
+        return ""
 
     def pressures(self, schedule: Schedule, index: int) -> Array:
         """Return the pressures (M,) [Pa] with which a setpoint is first sent."""

@@ -31,7 +31,7 @@ from der_planner.planning.plan_file import Plan, learned_plan
 from der_planner.planning.streaming import GRID, Schedule
 from der_planner.planning.workspace import BRANCHES
 from limb_interfaces import topics
-from limb_interfaces.parameters import declare
+from limb_interfaces.parameters import ParameterError, declare
 from limb_interfaces.stamps import NANOSECONDS, nanoseconds
 
 OLDEST_STAMP = 10
@@ -68,8 +68,7 @@ class PlannerOptions:
 
     def corrected(self, planned: Plan) -> Feedback:
         """Return feedback on a plan, with the reaction to a touch that is set."""
-        limit = self.force_limit if self.reaction == "yield" else 0.0
-        return Feedback(planned, self.reaction, limit or None)
+        return Feedback(planned, self.reaction, self.force_limit or None)
 
     def as_now(self, node: Node) -> PlannerOptions:
         """Return the parameters with what may be changed while the node runs as it is now."""
@@ -101,7 +100,7 @@ def read_parameters(node: Node) -> PlannerOptions:
         "learned_plans", "", "folder of learned plans: a command of the method 'learned' names one "
         "of them in place of its motion"
     )  # fmt: skip
-    return PlannerOptions(
+    options = PlannerOptions(
         limb=limb.mounted(mounting) if mounting else limb,
         limb_file=str(Path(limb_file).absolute()) if limb_file else "",
         payload=read(
@@ -161,6 +160,12 @@ def read_parameters(node: Node) -> PlannerOptions:
         ),
         obstacles=Obstacles.from_yaml(in_the_way) if in_the_way else None,
     )  # fmt: skip
+    if options.force_limit and options.reaction != "yield":
+        raise ParameterError(
+            f"parameter 'force_limit' is what the reaction yield allows, 'reaction' is "
+            f"{options.reaction}: leave one of them out"
+        )
+    return options
 
 
 # Messages that ask for a motion ------------------------------------------------------------------
