@@ -163,3 +163,6 @@ def test_impossible_loads_are_refused(changes, match):
         LimbTwin(0, **changes)
     with pytest.raises(TwinError, match="to take"):
         LimbTwin(0).push(Push(0.0, 0.244, mass=-1.0))
+    for strong in ({"mass": 20.0}, {"force": (0.0, 300.0, 0.0)}):
+        with pytest.raises(TwinError, match="times the limb's weight"):
+            LimbTwin(0).push(Push(0.0, 0.244, **strong))

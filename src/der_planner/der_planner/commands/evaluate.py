@@ -134,6 +134,6 @@ def _touched(run: RunSeries, given: argparse.Namespace) -> list[str]:
     except ValueError as error:
         raise EvaluationError(f"{run.description.title}: {error}") from error
     return [
-        f"touched from {each.since:.2f} s on, surest at {each.time:.2f} s: {each.said}"
-        for each in found
+        f"touched from {each.since:.2f} to {end:.2f} s, surest at {each.time:.2f} s: {each.said}"
+        for each, end in found
     ] or ["nothing touched the limb"]

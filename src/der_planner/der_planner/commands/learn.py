@@ -55,10 +55,10 @@ def _learn(given: argparse.Namespace) -> int:
         last = learner.history[-1]
         said = f"mean error {last.mean_error * 100:.3f} cm; {last.reason}"
         print(f"{run.description.title}: {said}")
-        for touch in touches(*filmed(first, run)) if len(run.measured) else ():
+        for touch, end in touches(*filmed(first, run)) if len(run.measured) else ():
             print(
-                f"warning: something seems to touch the limb in it from {touch.since:.1f} s on "
-                f"({touch.said}): learn from runs that nothing touches",
+                f"warning: something seems to touch the limb in it from {touch.since:.1f} to "
+                f"{end:.1f} s ({touch.said}): learn from runs that nothing touches",
                 file=sys.stderr,
             )
     if not any(run.accepted for run in learner.history):

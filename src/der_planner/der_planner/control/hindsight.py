@@ -103,8 +103,8 @@ def smooth(plan: Plan, filmed: Filmed) -> Smoothed:
     return _backward(*_forward(plan, filmed, _SLOW))
 
 
-def touches(plan: Plan, filmed: Filmed) -> list[Touch]:
-    """Return what touched the limb in a recorded run, each as it was when it was surest.
+def touches(plan: Plan, filmed: Filmed) -> list[tuple[Touch, float]]:
+    """Return what touched the limb in a recorded run, each when it was surest, and its end [s].
 
     Args:
         plan: what was played: limb, commands and reference.
@@ -114,14 +114,15 @@ def touches(plan: Plan, filmed: Filmed) -> list[Touch]:
         ValueError: no pictures or no measured pressures, or of another limb.
     """
     estimator, last = _forward(plan, filmed, EstimatorSettings())
-    nominal, found = estimator.nominal, dict[float, Touch]()
+    nominal, found = estimator.nominal, dict[float, tuple[Touch, float]]()
     sense = TouchSense(nominal.model)
     for j, known in enumerate(estimator.between(0, last)[1]):
         if j % STEPS == 0:
             touch = sense.feel(j * STEP, nominal, known)
-            best = found.get(touch.since)
-            if touch.touched and (best is None or touch.distance > best.distance):
-                found[touch.since] = touch
+            if touch.touched:
+                best, _ = found.get(touch.since, (touch, 0.0))
+                surest = max(best, touch, key=lambda each: each.distance)
+                found[touch.since] = surest, touch.time
     return list(found.values())
 
 

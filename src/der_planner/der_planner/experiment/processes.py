@@ -311,6 +311,7 @@ class NodeProcess:
         name: str = "",
     ) -> None:
         self.name = name or executable
+        self.executable = executable
         self.log = folder / f"{self.name}.log"
         self.cpu_seconds = 0.0
         """User and system time that the process had used when it was last looked at [s]."""

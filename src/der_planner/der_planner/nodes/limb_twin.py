@@ -141,6 +141,9 @@ class LimbTwinNode(Node):
                 )
         except TwinError as error:
             self.get_logger().error(f"{topics.TWIN_PUSH} was not taken: {error}")
+        else:
+            what = f"{math.hypot(force.x, force.y):g} N and {message.mass:g} kg"
+            self.get_logger().info(f"pushed by {what} at {message.arc_length:g} m")
 
     def _work(self) -> None:
         try:

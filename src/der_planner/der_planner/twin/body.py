@@ -11,7 +11,7 @@ from elastica import CosseratRod
 from numpy.typing import NDArray
 
 from der_planner.arrays import Array
-from der_planner.limb import BEYOND_THE_TIP
+from der_planner.limb import BEYOND_THE_TIP, GRAVITY
 from der_planner.twin.hardware import DrawnHardware
 from der_planner.twin.kernel import RodArrays, SectionMaterial
 
@@ -160,6 +160,10 @@ class TwinError(RuntimeError):
     """The simulated limb was asked for something impossible, or left the range of its physics."""
 
 
+STRONGEST_PUSH = 10.0
+"""Force of the strongest push, over the limb's weight: beyond it the rod's steps are too long."""
+
+
 @dataclass(frozen=True)
 class Push:
     """A force on the limb, or a mass that is hung on it, for a while.
@@ -226,11 +230,17 @@ class NodeLoads:
         """Take a push into the schedule; `update` puts it on the nodes when it is time.
 
         Raises:
-            TwinError: the place is not on the limb, a number is not finite, or more mass is taken
-                off than there is.
+            TwinError: the place is not on the limb, a number is not finite, more mass is taken off
+                than there is, or the push is too strong for the limb.
         """
         if not np.all(np.isfinite([*push.force, push.mass])) or len(push.force) != 3:
             raise TwinError(f"force and mass of a push must be finite, got {push}")
+        weight, pull = GRAVITY * float(self._own_mass.sum()), GRAVITY * max(0.0, push.mass)
+        if np.linalg.norm(push.force) + pull > STRONGEST_PUSH * weight:
+            raise TwinError(
+                f"a push is more than {STRONGEST_PUSH:.0f} times the limb's weight of "
+                f"{weight:.2g} N: give N and kg, got {push}"
+            )
         if math.isnan(push.instant) or not push.duration > 0:
             raise TwinError(f"a push needs an instant and a duration above 0 s, got {push}")
         shares = self._shares(push.arc_length)
