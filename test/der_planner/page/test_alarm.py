@@ -14,7 +14,7 @@ from rcl_interfaces.msg import Log
 from waiting import Clock, wait_for
 
 from der_msgs.msg import PressureState
-from der_planner.page.situation import DEAD, FRESH, Situation
+from der_planner.page.situation import DEAD, FRESH, Situation, as_typed
 from limb_interfaces.diagnostics import ENDED_IN_ORDER
 
 
@@ -145,6 +145,17 @@ def test_an_experiment_between_two_runs_alarms_nobody(situation: Situation, cloc
     (first, second) = alarms(situation)
     assert "The experiment is dead" in first["text"]
     assert "ended in order" in second["text"]
+
+
+def test_a_node_is_started_again_as_people_start_it() -> None:
+    words = [
+        "/w/.venv/bin/python",
+        "/w/install/der_planner/lib/der_planner/planner",
+        "-p",
+        "a:=b c",
+    ]
+    assert as_typed(words) == "scripts/ros2 run der_planner planner -p 'a:=b c'"
+    assert as_typed(["sleep", "60"]) == "sleep 60"
 
 
 def test_what_is_missing_of_a_graph_is_named_with_the_command(situation: Situation) -> None:

@@ -10,6 +10,7 @@ import time
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import psutil
@@ -307,9 +308,18 @@ def _process(identity: str) -> tuple[psutil.Process | None, str]:
         return None, ""
     try:
         process = psutil.Process(int(number))
-        return process, shlex.join(process.cmdline())
+        return process, as_typed(process.cmdline())
     except psutil.Error:
         return None, ""
+
+
+def as_typed(words: Sequence[str]) -> str:
+    """Return the command by which people start a process; that of a node needs its workspace."""
+    for place, word in enumerate(words[:2]):
+        *_, library, package, executable = ("", "", "", *Path(word).parts)
+        if library == "lib":
+            return shlex.join(["scripts/ros2", "run", package, executable, *words[place + 1 :]])
+    return shlex.join(words)
 
 
 def _trouble(process: psutil.Process | None) -> str:
