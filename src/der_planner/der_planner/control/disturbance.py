@@ -296,8 +296,9 @@ def chambers_beyond(
         return None
     order = np.argsort(instants[whole], kind="stable")
     instants, values = instants[whole][order], values[whole][order]
-    middle = setpoints + 0.5 * (setpoints[1] - setpoints[0])
-    told = (middle >= instants[0]) & (middle <= instants[-1])
+    period = setpoints[1] - setpoints[0]
+    middle = setpoints + 0.5 * period
+    told = (middle > instants[0] - period) & (middle < instants[-1] + period)
     if not told.any():
         return None
     beyond = np.where(told[:, None], interpolate(middle, instants, values) - expected, 0.0)

@@ -90,15 +90,12 @@ def kept_unknowns(free: FreeTerms) -> Iterator[Unknown]:
 
 
 def at_bounds(free: FreeTerms, values: Array) -> Iterator[str]:
-    """Yield a sentence for each unknown at the end of its range.
-
-    A term that is zero has none, nor friction that turns round at once, as on most limbs.
-    """
+    """Yield a sentence for each unknown at the end of its range, but for a term that is zero."""
     ends = free.unknowns.at_bound(values)
     for term, (segment, _), value, at_end in zip(
         free.terms, free.places, values, ends, strict=True
     ):
-        absent = value < 0.5 * term.high and (term.low == 0.0 or term.group == "friction")
+        absent = term.low == 0.0 and value < 0.5 * term.high
         if at_end and not absent:
             factor, unit = readable(term.unit)
             size = math.exp(value) if term.relative else factor * value
