@@ -67,7 +67,7 @@ def estimate_run(planned: Plan, run: RunSeries) -> Smoothed:
 def _said(smoothed: Smoothed, run: RunSeries) -> list[str]:
     """Return what there is to say of a run, a line each."""
     deviation = np.sqrt(np.trace(smoothed.tip_covariance, axis1=1, axis2=2).mean())
-    seen = run.tip.time[np.isfinite(run.tip.value).all(axis=1)]
+    seen = run.tip.known.time
     lines = [
         f"seen from {seen[0]:.1f} to {seen[-1]:.1f} s of {smoothed.time[-1]:.1f} s",
         f"tip known to {deviation * 1000:.2f} mm (standard deviation)",

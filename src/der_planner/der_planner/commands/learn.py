@@ -55,7 +55,8 @@ def _learn(given: argparse.Namespace) -> int:
         last = learner.history[-1]
         said = f"mean error {last.mean_error * 100:.3f} cm; {last.reason}"
         print(f"{run.description.title}: {said}")
-        for touch, end in touches(*filmed(first, run)) if len(run.measured) else ():
+        judged = last.accepted and len(run.measured.known) > 0
+        for touch, end in touches(*filmed(first, run)) if judged else ():
             print(
                 f"warning: something seems to touch the limb in it from {touch.since:.1f} to "
                 f"{end:.1f} s ({touch.said}): learn from runs that nothing touches",

@@ -46,8 +46,9 @@ class PoseLog:
 
 
 def is_bag(path: Path) -> bool:
-    """Tell whether a path is that of a bag."""
-    return path.is_dir() or path.suffix in (".mcap", ".db3")
+    """Tell whether a path is that of a bag; one of nothing is, if it has no ending."""
+    nothing = not (path.suffix or path.exists())
+    return nothing or path.is_dir() or path.suffix in (".mcap", ".db3")
 
 
 def read_poses(path: Path) -> PoseLog:
