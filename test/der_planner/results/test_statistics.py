@@ -167,3 +167,13 @@ def test_lost_late_and_swapped_commands_are_told_apart():
     values[20] += 3000.0
     wrong = check_board(board(command=values))
     assert wrong["board_lost"] == 1
+
+
+def test_commands_of_one_value_are_in_order_however_late():
+    whole = board()
+    time = whole.command_time.copy()
+    time[20] += 0.04
+    time[21] += 0.008
+    still = board(command_time=time, setpoint=np.zeros((50, 2)), command=np.zeros((50, 2)))
+    checks = check_board(still)
+    assert (checks["board_lost"], checks["board_out_of_order"]) == (0, 0)

@@ -7,6 +7,7 @@ simulated one, and the board's log of commands with the setpoints.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -240,9 +241,9 @@ def check_board(log: BoardLog | None) -> dict[str, float]:
 
     Returns:
         ``board_setpoints`` sent, ``board_received`` of them, ``board_lost`` (not found),
-        ``board_out_of_order`` (received before an earlier one), ``board_lateness_…_s`` after the
-        stamp (NaN without any), ``board_value_error_pa`` (up to 100 is the wire's rounding);
-        nothing where there is no log.
+        ``board_out_of_order`` (received before an earlier one, where their values tell the two
+        apart), ``board_lateness_…_s`` after the stamp (NaN without any), ``board_value_error_pa``
+        (up to 100 is the wire's rounding); nothing where there is no log.
     """
     if log is None or not len(log.setpoint_time):
         return {}
@@ -270,11 +271,15 @@ def check_board(log: BoardLog | None) -> dict[str, float]:
     late = np.array([log.command_time[c] - log.setpoint_time[s] for s, c in matched.items()])
     median, high = np.quantile(late, [0.5, 0.99]) if len(late) else (np.nan, np.nan)
     wrong = [difference(*pair) for pair in matched.items()]
+    crossed = [
+        first > second and max(difference(s, second), difference(t, first)) > ROUNDING
+        for (s, first), (t, second) in itertools.pairwise(sorted(matched.items()))
+    ]
     return {
         "board_setpoints": len(log.setpoint_time),
         "board_received": len(matched),
         "board_lost": len(log.setpoint_time) - len(matched),
-        "board_out_of_order": int(np.sum(np.diff([matched[s] for s in sorted(matched)]) < 0)),
+        "board_out_of_order": sum(crossed),
         "board_lateness_p50_s": float(median),
         "board_lateness_p99_s": float(high),
         "board_lateness_max_s": float(late.max()) if len(late) else float("nan"),
