@@ -20,8 +20,7 @@ signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 WHOLE_GRAPH = (
-    *("test_calibration", "test_experiment", "test_page_drawing", "test_reference"),
-    "test_two_computers",
+    *("test_calibration", "test_experiment", "test_page_drawing", "test_two_computers"),
 )
 """Files of test/graph that run the whole graph, where each node is timed by the others."""
 LONGEST = "test/documentation/test_site.py"

@@ -51,6 +51,14 @@ def test_a_motion_into_a_peg_is_refused_with_instant_place_and_clearance(free, s
     plan(LIMB, MOTION, method="projected", obstacles=circle(point, allowed=1.1 * error.force))
 
 
+@pytest.mark.parametrize("method", ["projected", "optimal"])
+def test_no_allowed_force_leads_a_limb_through_a_peg(free, method):
+    k = int(np.argmax(free.bend_angles.sum(axis=1)))
+    half_way = (free.curve(0) + free.curve(k))[len(free.curve(k)) * 4 // 5] / 2
+    with pytest.raises(ObstacleError, match="which no force brings about"):
+        plan(LIMB, MOTION, method=method, obstacles=circle(half_way, allowed=100.0))
+
+
 @pytest.mark.parametrize("mounting", ["horizontal", "sideways"])
 def test_the_optimal_plan_leads_the_limb_past_what_it_cannot_touch(mounting):
     limb = LIMB.mounted(mounting)

@@ -11,6 +11,7 @@ The clearance of a pose is the distance of its centreline from an obstacle less 
 is negative, the limb does not come so far: what does not move pushes it back by that much, with the
 force that the compliance there gives, f = −clearance / (nᵀ C_p n). A motion for which this is more
 than an obstacle allows is refused, or, by the method ``optimal``, led past it first (`led_past`).
+So is one in which the limb would come out on the obstacle's other side, whatever is allowed.
 """
 
 from __future__ import annotations
@@ -86,7 +87,7 @@ class ObstacleError(PlanningError):
         time: when it would be worst [s].
         place: along the limb from its clamp [m].
         clearance: there, negative [m].
-        force: that it would take [N].
+        force: that it would take [N]; infinite where the limb would come out on the other side.
         obstacle: which one.
     """
 
@@ -98,10 +99,15 @@ class ObstacleError(PlanningError):
 
     def __str__(self) -> str:
         """Return a sentence for people."""
+        with_force = (
+            f"with {self.force:.2f} N ({self.obstacle.allowed_force:.2f} N are allowed)"
+            if math.isfinite(self.force)
+            else "and through it, which no force brings about"
+        )
         return (
             f"at t = {self.time:.2f} s the limb would run {-self.clearance * 1000:.1f} mm into "
-            f"{self.obstacle}, {self.place * 100:.1f} cm from its clamp, with {self.force:.2f} N "
-            f"({self.obstacle.allowed_force:.2f} N are allowed): shrink or move the motion"
+            f"{self.obstacle}, {self.place * 100:.1f} cm from its clamp, {with_force}: shrink or "
+            "move the motion"
         )
 
 
@@ -114,12 +120,14 @@ class Nearest:
         index: of the pose.
         place: along the limb from its clamp [m].
         out: (2,) direction out of the obstacle.
+        passes: whether the limb would come out of the obstacle on the other side.
     """
 
     clearance: float
     index: int
     place: float
     out: Array
+    passes: bool
 
 
 @dataclass(frozen=True)
@@ -183,10 +191,16 @@ class Obstacles:
         pieces = curves[:, :-1, None] + share[:, None] * np.diff(curves, axis=1)[:, :, None]
         points = np.concatenate([pieces.reshape(len(curves), -1, 2), curves[:, -1:]], axis=1)
         distance, out = obstacle.away(points)
-        k, p = np.unravel_index(int(np.argmin(distance)), distance.shape)
-        along = np.linalg.norm(np.diff(points[k], axis=0), axis=1)[:p].sum()
-        clearance = float(distance[k, p]) - self.limb_radius
-        return Nearest(clearance, int(k), float(along + points[k, 0, 0]), out[k, p])
+        clearance = distance.min(axis=1) - self.limb_radius
+        closest = distance.argmin(axis=1)
+        k = int(clearance.argmin())
+        along = np.linalg.norm(np.diff(points[k], axis=0), axis=1)[: closest[k]].sum()
+        # Between two poses inside, the side on which the limb leaves it changes.
+        sides = out[np.arange(len(out)), closest]
+        inside = (clearance[:-1] < 0.0) & (clearance[1:] < 0.0)
+        passes = bool(np.any(inside & (np.sum(sides[:-1] * sides[1:], axis=1) < 0.0)))
+        place = float(along + points[k, 0, 0])
+        return Nearest(float(clearance[k]), k, place, sides[k], passes)
 
     def check_rest(self, model: RodModel, curve: Array, bend: Array) -> None:
         """Refuse numbers in another unit, and obstacles where the limb rests.
@@ -235,7 +249,7 @@ class Obstacles:
             if found.clearance >= 0.0:
                 continue
             slack = _slack(model, bend_angles[found.index], found)
-            force = -found.clearance / slack if slack > 0.0 else math.inf
+            force = -found.clearance / slack if slack > 0.0 and not found.passes else math.inf
             if force > obstacle.allowed_force:
                 instant = float(time[found.index])
                 raise ObstacleError(instant, found.place, found.clearance, force, obstacle)
