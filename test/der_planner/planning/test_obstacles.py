@@ -48,7 +48,9 @@ def test_a_motion_into_a_peg_is_refused_with_instant_place_and_clearance(free, s
     # So it is with a force that is a little too small, and not with one that is enough.
     with pytest.raises(ObstacleError):
         plan(LIMB, MOTION, method="projected", obstacles=circle(point, allowed=0.9 * error.force))
-    plan(LIMB, MOTION, method="projected", obstacles=circle(point, allowed=1.1 * error.force))
+    enough = circle(point, allowed=1.1 * error.force)
+    said = " ".join(plan(LIMB, MOTION, method="projected", obstacles=enough).warnings)
+    assert f"with up to {error.force:.2f} N; the tip is predicted as if nothing held it" in said
 
 
 @pytest.mark.parametrize("method", ["projected", "optimal"])

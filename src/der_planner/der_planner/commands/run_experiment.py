@@ -322,7 +322,8 @@ def _describe(
     progress.say(f"loads: {_loads(limb)}")
     progress.say(f"stage: {_stage(options)}")
     if (in_the_way := options.in_the_way) is not None:
-        progress.say(f"in the way: {', '.join(map(str, in_the_way.items))}")
+        later = ", looked at once the limb is calibrated" if options.calibrate else ""
+        progress.say(f"in the way: {', '.join(map(str, in_the_way.items))}{later}")
     if options.feedback:
         limit = f", up to {options.force_limit} N" if options.force_limit else ""
         progress.say(f"what touches the limb under feedback: {options.reaction}{limit}")

@@ -232,8 +232,10 @@ class Obstacles:
                 "clamp, limb_radius_m as it is, and a normal that points to the limb's side"
             ) from error
 
-    def check(self, model: RodModel, time: Array, curves: Array, bend_angles: Array) -> None:
+    def check(self, model: RodModel, time: Array, curves: Array, bend_angles: Array) -> str:
         """Refuse a motion that would touch an obstacle with more force than that allows.
+
+        Returns a sentence on those that are touched with what is allowed; empty where none is.
 
         Args:
             model: rod of the limb.
@@ -244,6 +246,7 @@ class Obstacles:
         Raises:
             ObstacleError: names instant, place, clearance and force.
         """
+        touched = []
         for obstacle in self.items:
             found = self.nearest(obstacle, curves)
             if found.clearance >= 0.0:
@@ -253,6 +256,10 @@ class Obstacles:
             if force > obstacle.allowed_force:
                 instant = float(time[found.index])
                 raise ObstacleError(instant, found.place, found.clearance, force, obstacle)
+            touched.append(f"{obstacle} with up to {force:.2f} N")
+        if not touched:
+            return ""
+        return f"it touches {', '.join(touched)}; the tip is predicted as if nothing held it"
 
     def led_past(self, model: RodModel, curves: Array, bend_angles: Array) -> Array:
         """Return by how much the tip is led aside (K, 2) [m] to keep off what is in the way.

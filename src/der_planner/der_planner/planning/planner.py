@@ -216,8 +216,8 @@ def _past(
             f"what is in the way leads the tip up to {off.max() * 1000:.1f} mm off its path, at "
             f"{time[off.argmax()]:.1f} s; errors count from the path past it"
         )
-    obstacles.check(rod, time, curves, bend)
-    return configuration, led, reference
+    touched = obstacles.check(rod, time, curves, bend)
+    return configuration, "; ".join(filter(None, [led, touched])), reference
 
 
 def choose_method(model: str, method: str) -> str:
