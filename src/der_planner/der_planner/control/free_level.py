@@ -26,9 +26,9 @@ _FREE_LEVEL = 250.0, 2e-3
 """Standard deviations of c, of a limb that nothing is known of yet [Pa], and of the tip [m]."""
 _FREE_NOISE = 110.0, 2e-4
 """The same of e and noise together."""
-_FREE_GAIN, _FREE_COUPLING, _FREE_TIP = 0.1, 0.03, 1e-7
+_FREE_GAIN, _FREE_COUPLING, _FREE_TIP = 0.07, 0.03, 1e-7
 """The same of γ by a segment's own pressure and by that of another, and of the tip [m/Pa]."""
-_FREE_STIFFNESS, _FREE_TIP_BENT = 0.15, 1e-3
+_FREE_STIFFNESS, _FREE_TIP_BENT = 0.08, 1e-3
 """The same of κ, over the segment's stiffness, and of the tip [m/rad]."""
 _FREE_FRICTION = 0.15
 """The same of φ, over the largest friction that the model knows."""
@@ -45,7 +45,7 @@ _WATCHED = 600.0
 """Time in which noise that was watched is forgotten [s]."""
 _SAYS_NEW = 0.5
 """Time after which noise says something new of c, γ, κ and e [s]."""
-_FRICTION_WRONG = 0.75
+_FRICTION_WRONG = 0.4
 """Standard deviation of friction from its model where it turns round, over its largest."""
 _FRICTION_SLIDING = 0.0025
 """Its variance elsewhere, over the square of its largest."""
@@ -55,8 +55,9 @@ half lets it follow changes, of which a limb that nothing touches has few. With 
 a random walk is known to K r, and what does not walk to K r / (2 − K)."""
 _STICKS = 0.01
 """Rate of a bend angle below which its segment may stick [rad/s]."""
-_SLIDES_AFTER = 0.1
-"""Way of a bend angle after which friction holds it as it should, once it has turned [rad]."""
+_SLIDES_AFTER, _LATEST_SLIDE = 2.0, 0.1
+"""Way of a bend angle after which friction holds it as it should, once it has turned: over the
+angle in which its model turns, and at the most [rad]."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +106,9 @@ class Lacking:
         # A bend that goes the other way than its friction says has turned, and friction with it.
         goes_on = np.maximum(slid * np.sign(turned), 0.0)
         slow = 1.0 / (1.0 + (rate / _STICKS) ** 2)
-        sticks = np.maximum(slow, np.exp(-goes_on / _SLIDES_AFTER))
+        turns = np.array([s.friction_curvature * s.length for s in limb.segments])
+        after = np.minimum(_SLIDES_AFTER * turns, _LATEST_SLIDE)
+        sticks = np.maximum(slow, np.exp(-goes_on / np.maximum(after, 1e-6)))
         sticks = np.minimum(1.0, sticks + 1.0 - turned**2)
         pressure, uneven = _friction(limb)
         spread[:inputs, :inputs] += _FRICTION_SLIDING * np.diag(pressure**2)
