@@ -19,7 +19,7 @@ sys.path.insert(0, str(ROOT / "test" / "support"))
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
-WHOLE_GRAPH = (*("test_calibration", "test_experiment", "test_page_drawing", "test_two_computers"),)
+WHOLE_GRAPH = ("test_calibration", "test_experiment", "test_page_drawing", "test_two_computers")
 """Files of test/graph that run the whole graph, where each node is timed by the others."""
 LONGEST = "test/documentation/test_site.py"
 """The file without nodes that takes longest."""

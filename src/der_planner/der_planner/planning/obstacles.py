@@ -87,7 +87,7 @@ class ObstacleError(PlanningError):
         time: when it would be worst [s].
         place: along the limb from its clamp [m].
         clearance: there, negative [m].
-        force: that it would take [N]; infinite where the limb would come out on the other side.
+        force: that it would take [N]; infinite where none brings it about.
         obstacle: which one.
     """
 
@@ -102,7 +102,7 @@ class ObstacleError(PlanningError):
         with_force = (
             f"with {self.force:.2f} N ({self.obstacle.allowed_force:.2f} N are allowed)"
             if math.isfinite(self.force)
-            else "and through it, which no force brings about"
+            else "which no force brings about"
         )
         return (
             f"at t = {self.time:.2f} s the limb would run {-self.clearance * 1000:.1f} mm into "
@@ -259,7 +259,7 @@ class Obstacles:
             touched.append(f"{obstacle} with up to {force:.2f} N")
         if not touched:
             return ""
-        return f"it touches {', '.join(touched)}; the tip is predicted as if nothing held it"
+        return f"the limb touches {', '.join(touched)}; the tip is predicted as if nothing held it"
 
     def led_past(self, model: RodModel, curves: Array, bend_angles: Array) -> Array:
         """Return by how much the tip is led aside (K, 2) [m] to keep off what is in the way.
