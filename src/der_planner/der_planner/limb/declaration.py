@@ -104,34 +104,35 @@ def parameter(
     text: str,
     choose: str,
     *,
+    default: Any = dataclasses.MISSING,
     interval: str = "(-inf, inf)",
     needs: str = "",
     fit: Term | None = None,
-) -> dict[str, Parameter]:
-    """Return the metadata of a dataclass field that declares a parameter.
+) -> Any:
+    """Return the field of a dataclass that declares a parameter.
 
     Args:
         unit: SI; "-" for none.
         text: what it is.
         choose: how to find its value.
+        default: of the field; left out: it has none.
         interval: the range, "[0, 1)" where 0 is allowed and 1 is not.
         needs: as `Parameter`.
         fit: the unknown of the fit, if any.
     """
     low, high = map(float, interval[1:-1].split(","))
-    return {
-        _KEY: Parameter(
-            unit=unit,
-            text=text,
-            choose=choose,
-            low=low,
-            high=high,
-            low_allowed=not interval.startswith("(") or low == -math.inf,
-            high_allowed=not interval.endswith(")") or high == math.inf,
-            needs=needs,
-            fit=fit,
-        )
-    }
+    declared = Parameter(
+        unit=unit,
+        text=text,
+        choose=choose,
+        low=low,
+        high=high,
+        low_allowed=not interval.startswith("(") or low == -math.inf,
+        high_allowed=not interval.endswith(")") or high == math.inf,
+        needs=needs,
+        fit=fit,
+    )
+    return field(default=default, metadata={_KEY: declared})
 
 
 def declarations(kind: Any) -> dict[str, Parameter]:

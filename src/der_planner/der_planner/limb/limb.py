@@ -66,35 +66,29 @@ class Limb:
     name: str
     segments: tuple[Segment, ...]
     pneumatics: Pneumatics
-    connector_length: float = field(
+    connector_length: float = parameter(
+        "m",
+        "straight passive piece between two segments",
+        "measure it; 0 lets the rod's mesh choose one edge that belongs to neither segment",
         default=0.0,
-        metadata=parameter(
-            "m",
-            "straight passive piece between two segments",
-            "measure it; 0 lets the rod's mesh choose one edge that belongs to neither segment",
-            interval="[0, inf)",
-        ),
+        interval="[0, inf)",
     )
-    gravity: tuple[float, float, float] = field(
+    gravity: tuple[float, float, float] = parameter(
+        "m/s²",
+        "acceleration in limb_base: x along the straight limb, y to its left",
+        "zeros for a limb that lies on a plate, [9.81, 0, 0] for one that hangs from its "
+        "clamp, [0, 0, -9.81] for one that is level and free to sag out of its plane",
         default=(0.0, 0.0, 0.0),
-        metadata=parameter(
-            "m/s²",
-            "acceleration in limb_base: x along the straight limb, y to its left",
-            "zeros for a limb that lies on a plate, [9.81, 0, 0] for one that hangs from its "
-            "clamp, [0, 0, -9.81] for one that is level and free to sag out of its plane",
-        ),
     )
     calibrated: CalibratedRange = field(default_factory=CalibratedRange)
     provenance: Mapping[str, Any] = field(default_factory=dict)
     pcc_segments: tuple[Segment, ...] = ()
-    base_length: float = field(
+    base_length: float = parameter(
+        "m",
+        "straight passive piece between the clamp and the first segment",
+        "measure it; the calibration corrects it by the tip",
         default=0.0,
-        metadata=parameter(
-            "m",
-            "straight passive piece between the clamp and the first segment",
-            "measure it; the calibration corrects it by the tip",
-            interval="[0, inf)",
-        ),
+        interval="[0, inf)",
     )
     masses: tuple[PointMass, ...] = ()
 

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from der_planner.limb.declaration import LimbError, parameter
 
@@ -50,21 +50,17 @@ class PointMass:
     stiff base or its clamp does not move and has no effect.
     """
 
-    arc_length: float = field(
-        metadata=parameter(
-            "m",
-            "distance from the clamp along the limb",
-            "measure along the straight limb; the tip is at the sum of all lengths",
-            interval="[0, inf)",
-        )
+    arc_length: float = parameter(
+        "m",
+        "distance from the clamp along the limb",
+        "measure along the straight limb; the tip is at the sum of all lengths",
+        interval="[0, inf)",
     )
-    mass: float = field(
-        metadata=parameter(
-            "kg",
-            "what the limb carries there beside its own mass per length",
-            "weigh it, with its fastening and tags; what only one run carries is its payload",
-            interval="[0, inf)",
-        )
+    mass: float = parameter(
+        "kg",
+        "what the limb carries there beside its own mass per length",
+        "weigh it, with its fastening and tags; what only one run carries is its payload",
+        interval="[0, inf)",
     )
     name: str = "mass"
 

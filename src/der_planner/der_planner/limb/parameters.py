@@ -6,7 +6,7 @@ Checks, comments in limb files, the site's page and the unknowns of the fit foll
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from der_planner.limb.declaration import Term, parameter
 
@@ -26,218 +26,178 @@ class Segment:
     zero: the two are the same.
     """
 
-    length: float = field(
-        metadata=parameter(
-            "m",
-            "actuated length",
-            "measure what bends; the calibration corrects it by the tip",
-            interval="(0, inf)",
-        )
+    length: float = parameter(
+        "m",
+        "actuated length",
+        "measure what bends; the calibration corrects it by the tip",
+        interval="(0, inf)",
     )
-    bending_stiffness: float = field(
-        metadata=parameter(
-            "N·m²",
-            "bending stiffness EI",
-            "hold it level, hang a small force F on its end: EI = F L³ / (3 · extra deflection)",
-            interval="(0, inf)",
-            fit=Term(
-                *("log_stiffness", "-", 0.2, -1.2, 1.2, 0.3, "dynamics"),
-                relative=True,
-                kept=True,
-            ),
-        )
-    )
-    axial_stiffness: float = field(
-        metadata=parameter(
-            "N",
-            "stretching stiffness EA",
-            "pull it: force · length / extension; its value hardly matters far above EI / L²",
-            interval="(0, inf)",
-        )
-    )
-    torsional_stiffness: float = field(
-        metadata=parameter(
-            "N·m²",
-            "twisting stiffness GJ, which only the rod in space reads",
-            "a round section of incompressible rubber has 2/3 EI",
-            interval="(0, inf)",
-        )
-    )
-    mass_per_length: float = field(
-        metadata=parameter(
-            "kg/m",
-            "mass per length",
-            "weigh it, divide by its length",
-            interval="(0, inf)",
-            fit=Term(*("log_mass", "-", 0.1, -1.2, 1.2, 0.3, "mass"), relative=True, kept=True),
-        )
-    )
-    damping: float = field(
-        metadata=parameter(
-            "1/s",
-            "damping force per mass and velocity, by air and plate",
-            "twice the rate at which the amplitude of a free swing decays",
-            interval="[0, inf)",
-            fit=Term(
-                *("log_damping", "-", 0.5, -3.0, 3.0, 0.5, "dynamics"),
-                shared=True,
-                relative=True,
-                kept=True,
-            ),
-        )
-    )
-    moment_gain: float = field(
-        metadata=parameter(
-            "N·m/Pa",
-            "bending moment per differential pressure G",
-            "bend angle at a slow pressure / pressure · EI / L; leave it to the calibration",
-            interval="(0, inf)",
-            fit=Term(
-                *("gain", "rad/Pa", 5e-5, 5e-6, 5e-4, math.inf, "linear"),
-                per={"length": 1, "bending_stiffness": -1},
-            ),
-        )
-    )
-    rest_curvature: float = field(
-        default=0.0,
-        metadata=parameter(
-            "1/m",
-            "signed curvature at zero differential pressure, positive toward +y",
-            "bend angle at rest / length; leave it to the calibration",
-            fit=Term(
-                *("rest_angle", "rad", 0.02, -0.6, 0.6, REST_SPREAD, "linear"), per={"length": 1}
-            ),
+    bending_stiffness: float = parameter(
+        "N·m²",
+        "bending stiffness EI",
+        "hold it level, hang a small force F on its end: EI = F L³ / (3 · extra deflection)",
+        interval="(0, inf)",
+        fit=Term(
+            *("log_stiffness", "-", 0.2, -1.2, 1.2, 0.3, "dynamics"),
+            relative=True,
+            kept=True,
         ),
     )
-    cubic_stiffness: float = field(
-        default=0.0,
-        metadata=parameter(
-            "N·m⁴",
-            "k3 in moment = EI (κ − κ̄) + k3 (κ − κ̄)³",
-            "0 unless large bends fall short of small ones in proportion; calibration",
-            fit=Term(
-                *("cubic", "1/rad²", 0.05, -0.2, 0.5, 0.05, "cubic"),
-                per={"bending_stiffness": -1, "length": -2},
-            ),
+    axial_stiffness: float = parameter(
+        "N",
+        "stretching stiffness EA",
+        "pull it: force · length / extension; its value hardly matters far above EI / L²",
+        interval="(0, inf)",
+    )
+    torsional_stiffness: float = parameter(
+        "N·m²",
+        "twisting stiffness GJ, which only the rod in space reads",
+        "a round section of incompressible rubber has 2/3 EI",
+        interval="(0, inf)",
+    )
+    mass_per_length: float = parameter(
+        "kg/m",
+        "mass per length",
+        "weigh it, divide by its length",
+        interval="(0, inf)",
+        fit=Term(*("log_mass", "-", 0.1, -1.2, 1.2, 0.3, "mass"), relative=True, kept=True),
+    )
+    damping: float = parameter(
+        "1/s",
+        "damping force per mass and velocity, by air and plate",
+        "twice the rate at which the amplitude of a free swing decays",
+        interval="[0, inf)",
+        fit=Term(
+            *("log_damping", "-", 0.5, -3.0, 3.0, 0.5, "dynamics"),
+            shared=True,
+            relative=True,
+            kept=True,
         ),
     )
-    material_damping: float = field(
-        default=0.0,
-        metadata=parameter(
-            "s",
-            "Kelvin-Voigt time τ in moment = EI (κ + τ κ̇)",
-            "0.01 takes away ringing that a real limb does not show; calibration with fast motion",
-            interval="[0, inf)",
-            fit=Term(*("material_damping", "s", 0.01, 0.0, 0.1, 0.02, "dynamics"), kept=True),
+    moment_gain: float = parameter(
+        "N·m/Pa",
+        "bending moment per differential pressure G",
+        "bend angle at a slow pressure / pressure · EI / L; leave it to the calibration",
+        interval="(0, inf)",
+        fit=Term(
+            *("gain", "rad/Pa", 5e-5, 5e-6, 5e-4, math.inf, "linear"),
+            per={"length": 1, "bending_stiffness": -1},
         ),
     )
-    swing_inertia: float = field(
+    rest_curvature: float = parameter(
+        "1/m",
+        "signed curvature at zero differential pressure, positive toward +y",
+        "bend angle at rest / length; leave it to the calibration",
+        default=0.0,
+        fit=Term(*("rest_angle", "rad", 0.02, -0.6, 0.6, REST_SPREAD, "linear"), per={"length": 1}),
+    )
+    cubic_stiffness: float = parameter(
+        "N·m⁴",
+        "k3 in moment = EI (κ − κ̄) + k3 (κ − κ̄)³",
+        "0 unless large bends fall short of small ones in proportion; calibration",
+        default=0.0,
+        fit=Term(
+            *("cubic", "1/rad²", 0.05, -0.2, 0.5, 0.05, "cubic"),
+            per={"bending_stiffness": -1, "length": -2},
+        ),
+    )
+    material_damping: float = parameter(
+        "s",
+        "Kelvin-Voigt time τ in moment = EI (κ + τ κ̇)",
+        "0.01 takes away ringing that a real limb does not show; calibration with fast motion",
+        default=0.0,
+        interval="[0, inf)",
+        fit=Term(*("material_damping", "s", 0.01, 0.0, 0.1, 0.02, "dynamics"), kept=True),
+    )
+    swing_inertia: float = parameter(
+        "-",
+        "mass that resists acceleration over mass that weighs",
+        "1; less stands for friction, which stiffens small fast strokes; calibration",
         default=1.0,
-        metadata=parameter(
-            "-",
-            "mass that resists acceleration over mass that weighs",
-            "1; less stands for friction, which stiffens small fast strokes; calibration",
-            interval="(0, inf)",
-            fit=Term(
-                *("log_inertia", "-", 0.1, -0.7, 0.7, 0.2, "dynamics"),
-                shared=True,
-                relative=True,
-                kept=True,
-            ),
+        interval="(0, inf)",
+        fit=Term(
+            *("log_inertia", "-", 0.1, -0.7, 0.7, 0.2, "dynamics"),
+            shared=True,
+            relative=True,
+            kept=True,
         ),
     )
-    gain_asymmetry: float = field(
+    gain_asymmetry: float = parameter(
+        "-",
+        "relative gain of the left over the mean of both chambers",
+        "(left − right) / (left + right) of the bend angles by equal pressures; calibration",
         default=0.0,
-        metadata=parameter(
-            "-",
-            "relative gain of the left over the mean of both chambers",
-            "(left − right) / (left + right) of the bend angles by equal pressures; calibration",
-            interval="(-1, 1)",
-            fit=Term("gain_asymmetry", "-", 0.03, -0.4, 0.4, 0.1, "asymmetry"),
+        interval="(-1, 1)",
+        fit=Term("gain_asymmetry", "-", 0.03, -0.4, 0.4, 0.1, "asymmetry"),
+    )
+    pressure_stiffening: float = parameter(
+        "1/Pa",
+        "relative growth of the stiffness per |differential pressure|",
+        "0, or from the calibration, which hardly tells it from cubic_stiffness",
+        default=0.0,
+        fit=Term("pressure_stiffening", "1/Pa", 3e-6, -2e-5, 3e-5, 1e-5, "stiffening"),
+    )
+    friction_moment: float = parameter(
+        "N·m",
+        "saturation of a Dahl friction element",
+        "half of the pressure between the branches of a slow loop · moment_gain; calibration",
+        default=0.0,
+        interval="[0, inf)",
+        fit=Term(
+            *("friction_pressure", "Pa", 300.0, 0.0, 4000.0, 800.0, "friction"),
+            per={"moment_gain": -1},
+            start=200.0,
         ),
     )
-    pressure_stiffening: float = field(
+    friction_curvature: float = parameter(
+        "1/m",
+        "change of curvature over which friction turns round",
+        "bend angle in which a reversal has made 63 % of its way / length; calibration",
         default=0.0,
-        metadata=parameter(
-            "1/Pa",
-            "relative growth of the stiffness per |differential pressure|",
-            "0, or from the calibration, which hardly tells it from cubic_stiffness",
-            fit=Term("pressure_stiffening", "1/Pa", 3e-6, -2e-5, 3e-5, 1e-5, "stiffening"),
+        interval="[0, inf)",
+        needs="friction_moment",
+        fit=Term(
+            *("friction_angle", "rad", 0.1, 0.02, 0.8, 0.1, "friction"),
+            per={"length": 1},
+            start=0.1,
         ),
     )
-    friction_moment: float = field(
+    creep_stiffness: float = parameter(
+        "N·m²",
+        "stiffness of a Maxwell element beside EI",
+        "EI · relative growth of the bend angle while a pressure is held; calibration",
         default=0.0,
-        metadata=parameter(
-            "N·m",
-            "saturation of a Dahl friction element",
-            "half of the pressure between the branches of a slow loop · moment_gain; calibration",
-            interval="[0, inf)",
-            fit=Term(
-                *("friction_pressure", "Pa", 300.0, 0.0, 4000.0, 800.0, "friction"),
-                per={"moment_gain": -1},
-                start=200.0,
-            ),
+        interval="[0, inf)",
+        fit=Term(
+            *("creep_pressure", "Pa/rad", 500.0, 0.0, 15000.0, 2000.0, "creep"),
+            per={"moment_gain": -1, "length": -1},
+            start=400.0,
         ),
     )
-    friction_curvature: float = field(
+    creep_time: float = parameter(
+        "s",
+        "relaxation time of the Maxwell element",
+        "time in which that growth has come to 63 %; calibration",
         default=0.0,
-        metadata=parameter(
-            "1/m",
-            "change of curvature over which friction turns round",
-            "bend angle in which a reversal has made 63 % of its way / length; calibration",
-            interval="[0, inf)",
-            needs="friction_moment",
-            fit=Term(
-                *("friction_angle", "rad", 0.1, 0.02, 0.8, 0.1, "friction"),
-                per={"length": 1},
-                start=0.1,
-            ),
-        ),
+        interval="[0, inf)",
+        needs="creep_stiffness",
+        fit=Term("creep_time", "s", 15.0, 3.0, 120.0, 15.0, "creep", start=15.0),
     )
-    creep_stiffness: float = field(
+    coupling_before: float = parameter(
+        "-",
+        "moment by the pressure of the segment before, over that of its own: tubes, walls",
+        "pressurise the segment before alone: bend here / bend there, if alike; calibration",
         default=0.0,
-        metadata=parameter(
-            "N·m²",
-            "stiffness of a Maxwell element beside EI",
-            "EI · relative growth of the bend angle while a pressure is held; calibration",
-            interval="[0, inf)",
-            fit=Term(
-                *("creep_pressure", "Pa/rad", 500.0, 0.0, 15000.0, 2000.0, "creep"),
-                per={"moment_gain": -1, "length": -1},
-                start=400.0,
-            ),
-        ),
+        interval="(-0.5, 0.5)",
+        fit=Term("coupling_before", "-", 0.03, -0.4, 0.4, 0.05, "coupling", neighbour=-1),
     )
-    creep_time: float = field(
+    coupling_after: float = parameter(
+        "-",
+        "moment by the pressure of the segment after, over that of its own: tubes, walls",
+        "pressurise the segment after alone: bend here / bend there, if alike; calibration",
         default=0.0,
-        metadata=parameter(
-            "s",
-            "relaxation time of the Maxwell element",
-            "time in which that growth has come to 63 %; calibration",
-            interval="[0, inf)",
-            needs="creep_stiffness",
-            fit=Term("creep_time", "s", 15.0, 3.0, 120.0, 15.0, "creep", start=15.0),
-        ),
-    )
-    coupling_before: float = field(
-        default=0.0,
-        metadata=parameter(
-            "-",
-            "moment by the pressure of the segment before, over that of its own: tubes, walls",
-            "pressurise the segment before alone: bend here / bend there, if alike; calibration",
-            interval="(-0.5, 0.5)",
-            fit=Term("coupling_before", "-", 0.03, -0.4, 0.4, 0.05, "coupling", neighbour=-1),
-        ),
-    )
-    coupling_after: float = field(
-        default=0.0,
-        metadata=parameter(
-            "-",
-            "moment by the pressure of the segment after, over that of its own: tubes, walls",
-            "pressurise the segment after alone: bend here / bend there, if alike; calibration",
-            interval="(-0.5, 0.5)",
-            fit=Term("coupling_after", "-", 0.03, -0.4, 0.4, 0.05, "coupling", neighbour=1),
-        ),
+        interval="(-0.5, 0.5)",
+        fit=Term("coupling_after", "-", 0.03, -0.4, 0.4, 0.05, "coupling", neighbour=1),
     )
 
     @property
@@ -250,76 +210,60 @@ class Segment:
 class Pneumatics:
     """How a commanded differential pressure becomes a measured one, and what may be asked for."""
 
-    pressure_limit: float = field(
-        metadata=parameter(
-            "Pa",
-            "largest |differential pressure| of a plan",
-            "what the chambers bear for good, at most the driver's pressure_limit",
-            interval="(0, inf)",
-        )
+    pressure_limit: float = parameter(
+        "Pa",
+        "largest |differential pressure| of a plan",
+        "what the chambers bear for good, at most the driver's pressure_limit",
+        interval="(0, inf)",
     )
-    slew_limit: float = field(
-        metadata=parameter(
-            "Pa/s",
-            "largest |change of a commanded differential pressure| per second",
-            "at most the fill rate that the calibration's report names, and the driver's limit",
-            interval="(0, inf)",
-        )
+    slew_limit: float = parameter(
+        "Pa/s",
+        "largest |change of a commanded differential pressure| per second",
+        "at most the fill rate that the calibration's report names, and the driver's limit",
+        interval="(0, inf)",
     )
-    time_constant: float = field(
-        metadata=parameter(
-            "s",
-            "first-order lag from command to chamber",
-            "from the calibration",
-            interval="(0, inf)",
-        )
+    time_constant: float = parameter(
+        "s",
+        "first-order lag from command to chamber",
+        "from the calibration",
+        interval="(0, inf)",
     )
-    delay: float = field(
+    delay: float = parameter(
+        "s",
+        "dead time from command to the first change in the chamber",
+        "from the calibration",
         default=0.0,
-        metadata=parameter(
-            "s",
-            "dead time from command to the first change in the chamber",
-            "from the calibration",
-            interval="[0, inf)",
-        ),
+        interval="[0, inf)",
     )
-    vent_time_constant: float = field(
+    vent_time_constant: float = parameter(
+        "s",
+        "lag while |differential pressure| falls; 0: as time_constant",
+        "from the calibration",
         default=0.0,
-        metadata=parameter(
-            "s",
-            "lag while |differential pressure| falls; 0: as time_constant",
-            "from the calibration",
-            interval="[0, inf)",
-        ),
+        interval="[0, inf)",
     )
-    vent_rate: float = field(
+    vent_rate: float = parameter(
+        "Pa/s",
+        "fall of a chamber at 10 kPa with its outlet wide open; 0: no limit",
+        "from the calibration, or the steepest fall after a step from 10 kPa to 0",
         default=0.0,
-        metadata=parameter(
-            "Pa/s",
-            "fall of a chamber at 10 kPa with its outlet wide open; 0: no limit",
-            "from the calibration, or the steepest fall after a step from 10 kPa to 0",
-            interval="[0, inf)",
-        ),
+        interval="[0, inf)",
     )
-    vent_exponent: float = field(
+    vent_exponent: float = parameter(
+        "-",
+        "the fall grows with this power of the chamber's gauge pressure",
+        "1/2 is an orifice, 1 a tube (one exponential); a real limb had 2/3; calibration",
         default=2.0 / 3.0,
-        metadata=parameter(
-            "-",
-            "the fall grows with this power of the chamber's gauge pressure",
-            "1/2 is an orifice, 1 a tube (one exponential); a real limb had 2/3; calibration",
-            interval="(0, 1]",
-        ),
+        interval="(0, 1]",
     )
 
-    vent_lag_exponent: float = field(
+    vent_lag_exponent: float = parameter(
+        "-",
+        "vent_time_constant is that at 10 kPa and falls with this power of the chamber's gauge "
+        "pressure; 0: the same at all pressures",
+        "as vent_exponent for a valve that opens in proportion to its error; calibration",
         default=0.0,
-        metadata=parameter(
-            "-",
-            "vent_time_constant is that at 10 kPa and falls with this power of the chamber's gauge "
-            "pressure; 0: the same at all pressures",
-            "as vent_exponent for a valve that opens in proportion to its error; calibration",
-            interval="[0, 1]",
-        ),
+        interval="[0, 1]",
     )
 
     @property
@@ -332,29 +276,23 @@ class Pneumatics:
 class CalibratedRange:
     """What a calibration run covered, so that a plan beyond it can be recognised."""
 
-    differential_pressure: tuple[float, ...] = field(
+    differential_pressure: tuple[float, ...] = parameter(
+        "Pa",
+        "largest |differential pressure| seen",
+        "the calibration writes it",
         default=(),
-        metadata=parameter(
-            "Pa",
-            "largest |differential pressure| seen",
-            "the calibration writes it",
-            interval="[0, inf)",
-        ),
+        interval="[0, inf)",
     )
-    bend_angle: tuple[float, ...] = field(
+    bend_angle: tuple[float, ...] = parameter(
+        "rad",
+        "largest |bend angle| seen",
+        "the calibration writes it",
         default=(),
-        metadata=parameter(
-            "rad",
-            "largest |bend angle| seen",
-            "the calibration writes it",
-            interval="[0, inf)",
-        ),
+        interval="[0, inf)",
     )
-    gravity: tuple[float, ...] = field(
+    gravity: tuple[float, ...] = parameter(
+        "m/s²",
+        "gravity for which the limb's numbers were found; empty: the limb's gravity",
+        "leave it empty: it is noted where a run is mounted otherwise than the limb file",
         default=(),
-        metadata=parameter(
-            "m/s²",
-            "gravity for which the limb's numbers were found; empty: the limb's gravity",
-            "leave it empty: it is noted where a run is mounted otherwise than the limb file",
-        ),
     )
