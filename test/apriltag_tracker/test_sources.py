@@ -1,22 +1,30 @@
 from __future__ import annotations
 
+import array
 import threading
 import time
 
 import cv2
 import numpy as np
 import pytest
+from sensor_msgs.msg import Image
 from waiting import Clock, wait_for
 
 from apriltag_tracker.camera.images import (
     DeviceSource,
     ImageError,
     ImageReader,
-    SourceError,
-    VideoSource,
     open_source,
-    to_grey,
 )
+
+
+def to_grey(data, height, width, step, encoding, big_endian=False, reader=None):
+    """Return the grey picture of a message, read by a new reader if none is given."""
+    message = Image(
+        height=height, width=width, step=step, encoding=encoding, is_bigendian=big_endian
+    )
+    message.data = array.array("B", data)
+    return (reader or ImageReader()).to_grey(message)
 
 
 @pytest.fixture
@@ -57,8 +65,8 @@ def test_cameras_of_fewer_bits_than_their_words_are_as_bright_and_stay_so(pictur
     picture[0, 0] = 255
     reader, words = ImageReader(), picture.astype("<u2") << shift
     darker = (words >> 3).tobytes()
-    assert np.array_equal(reader.to_grey(words.tobytes(), 48, 64, 128, "mono16"), picture)
-    assert np.array_equal(reader.to_grey(darker, 48, 64, 128, "mono16"), picture >> 3)
+    assert np.array_equal(to_grey(words.tobytes(), 48, 64, 128, "mono16", reader=reader), picture)
+    assert np.array_equal(to_grey(darker, 48, 64, 128, "mono16", reader=reader), picture >> 3)
 
 
 @pytest.mark.parametrize("wide", [False, True])
@@ -110,12 +118,11 @@ def test_a_folder_is_played_in_order_at_its_rate(tmp_path, picture):
         grabbed = source.read()
         assert np.array_equal(grabbed.gray, picture // (k + 1))
         stamps.append(grabbed.stamp)
-        if k < 2:
-            clock.now += 50_000_000
-            assert source.read() is None
-            clock.now += 50_000_000
+        clock.now += 50_000_000
+        assert source.read() is None
+        clock.now += 50_000_000
     assert np.diff(stamps).tolist() == [100_000_000] * 2
-    with pytest.raises(SourceError, match="have been played"):
+    with pytest.raises(ImageError, match="have been played"):
         source.read()
 
 
@@ -129,11 +136,10 @@ def test_a_video_is_played_to_its_end(tmp_path, picture):
     writer.release()
     clock = Clock(1_000_000_000)
     source = open_source(str(path), 30.0, clock)
-    assert isinstance(source, VideoSource)
     for _ in range(3):
         assert source.read().gray.shape == (48, 64)
         clock.now += 50_000_000
-    with pytest.raises(SourceError, match="has been played"):
+    with pytest.raises(ImageError, match="has been played"):
         source.read()
     source.close()
 
@@ -142,7 +148,7 @@ def test_a_video_is_played_to_its_end(tmp_path, picture):
 def test_sources_that_are_not_there_are_named(tmp_path, name):
     (tmp_path / "folder").mkdir()
     path = name if name.startswith("/dev") else str(tmp_path / name)
-    with pytest.raises(SourceError, match=r"nowhere|video77|no picture"):
+    with pytest.raises(ImageError, match=r"nowhere|video77|no picture"):
         open_source(path, 30.0)
 
 
@@ -176,14 +182,14 @@ def test_an_unplugged_camera_is_named_and_comes_back(monkeypatch):
     def gone():
         try:
             source.read()
-        except SourceError as error:
+        except ImageError as error:
             return "unplugged" in str(error)
         return False
 
     def there():
         try:
             return source.read() is not None
-        except SourceError:
+        except ImageError:
             return False
 
     try:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from sensor_msgs.msg import CameraInfo, Image
 
 from apriltag_tracker.camera import CameraError, Intrinsics
-from apriltag_tracker.camera.images import Grabbed, ImageReader, Source, SourceError, open_source
+from apriltag_tracker.camera.images import ImageError, ImageReader, Source, open_source
 from apriltag_tracker.detection import Detector
 from apriltag_tracker.pipeline import (
     LimbObservation,
@@ -153,14 +153,7 @@ class TrackerNode(LimbStateNode):
     def _on_image(self, message: Image) -> None:
         self._frame = message.header.frame_id
         try:
-            gray = self._reader.to_grey(
-                message.data,
-                message.height,
-                message.width,
-                message.step,
-                message.encoding,
-                bool(message.is_bigendian),
-            )
+            gray = self._reader.to_grey(message)
         except ValueError as error:
             self._watch.arrived()
             self._fail(message.header.stamp, str(error))
@@ -170,8 +163,8 @@ class TrackerNode(LimbStateNode):
     def _poll_source(self) -> None:
         assert self._source is not None
         try:
-            grabbed: Grabbed | None = self._source.read()
-        except SourceError as error:
+            grabbed = self._source.read()
+        except ImageError as error:
             self._watch.image_problem = str(error)
             return
         if grabbed is not None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -61,7 +61,7 @@ PICTURES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm"}
 
 
 class ImageError(ValueError):
-    """An image message cannot be read; the message says what came and what is expected."""
+    """No image can be had; the message says from what, and what is expected or the remedy."""
 
 
 class ImageReader:
@@ -75,33 +75,19 @@ class ImageReader:
     def __init__(self) -> None:
         self._bits = 8
 
-    def to_grey(
-        self,
-        data: Any,
-        height: int,
-        width: int,
-        step: int,
-        encoding: str,
-        big_endian: bool = False,
-    ) -> NDArray[np.uint8]:
-        """Return the grey picture of an image message.
-
-        Args:
-            data: bytes of the message.
-            height: rows.
-            width: columns.
-            step: bytes from row to row.
-            encoding: as named by `sensor_msgs/image_encodings`.
-            big_endian: of 16-bit pixels.
+    def to_grey(self, message: Any) -> NDArray[np.uint8]:
+        """Return the grey picture of a `sensor_msgs/Image`.
 
         Raises:
             ImageError: unknown encoding, or fewer bytes than the size needs.
         """
+        height, width, step = message.height, message.width, message.step
+        encoding = message.encoding
         if encoding not in _ENCODINGS:
             raise ImageError(f"unknown encoding '{encoding}': {', '.join(_ENCODINGS)} are read")
         known = _ENCODINGS[encoding]
         row = width * known.width
-        raw = np.frombuffer(data, dtype=np.uint8)
+        raw = np.frombuffer(message.data, dtype=np.uint8)
         if height <= 0 or width <= 0 or step < row or raw.size < step * height:
             raise ImageError(
                 f"image of {width} x {height} px in {encoding} with {step} bytes a row has "
@@ -109,7 +95,7 @@ class ImageReader:
             )
         pixels = np.ascontiguousarray(raw[: step * height].reshape(height, step)[:, :row])
         if known.wide:
-            pixels = self._from_16_bits(pixels.view(">u2" if big_endian else "<u2"))
+            pixels = self._from_16_bits(pixels.view(">u2" if message.is_bigendian else "<u2"))
         elif known.conversion is None:
             return np.ascontiguousarray(pixels[:, known.first :: known.width])
         if known.conversion is None:
@@ -122,13 +108,6 @@ class ImageReader:
         used = int(words.max()).bit_length()
         self._bits = max(self._bits, min(2 * -(-used // 2), 16))
         return np.ascontiguousarray(words >> (self._bits - 8), dtype=np.uint8)
-
-
-def to_grey(
-    data: Any, height: int, width: int, step: int, encoding: str, big_endian: bool = False
-) -> NDArray[np.uint8]:
-    """Return the grey picture of one image message by itself, see `ImageReader.to_grey`."""
-    return ImageReader().to_grey(data, height, width, step, encoding, big_endian)
 
 
 def check_grey(image: Any) -> NDArray[np.uint8]:
@@ -147,10 +126,6 @@ def check_grey(image: Any) -> NDArray[np.uint8]:
     if image.ndim == 3:
         image = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     return np.ascontiguousarray(image)
-
-
-class SourceError(RuntimeError):
-    """No image can be had from a source; the message names it and the remedy."""
 
 
 @dataclass(frozen=True)
@@ -176,92 +151,97 @@ def open_source(
         size: width and height to ask a device for [px], those of its calibration.
 
     Raises:
-        SourceError: there is no such thing, or it cannot be opened.
+        ImageError: there is no such thing, or it cannot be opened.
     """
     path = Path(name)
     if name.isdigit() or name.startswith("/dev/"):
         return DeviceSource(name, rate, clock, size=size)
     if path.is_dir():
-        return FolderSource(path, rate, clock)
+        return _folder_source(path, rate, clock)
     if path.is_file():
-        return VideoSource(path, clock)
-    raise SourceError(
+        return _video_source(path, clock)
+    raise ImageError(
         f"source '{name}': 'topic', /dev/videoN, a video file or a folder of images expected"
     )
 
 
-class _Pace:
-    """Says when the next picture is due; one that comes late does not hurry the others."""
+def read_picture(path: Path) -> NDArray[np.uint8]:
+    """Read the file of a picture as grey.
 
-    def __init__(self, period: int) -> None:
-        self._period = period
-        self._due: int | None = None
-
-    def is_due(self, now: int) -> bool:
-        """Tell whether a picture is due, and if so, plan the next."""
-        if self._due is not None and now < self._due:
-            return False
-        late = self._due is not None and now - self._due < self._period
-        start = self._due if late and self._due is not None else now
-        self._due = start + self._period
-        return True
+    Raises:
+        ImageError: OpenCV cannot read it.
+    """
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    if image is None:
+        raise ImageError(f"{path} is no picture that OpenCV reads")
+    return np.asarray(image, dtype=np.uint8)
 
 
-class FolderSource:
-    """Plays the pictures of a folder in the order of their names."""
+class FileSource:
+    """Plays pictures at a steady rate; one that comes late does not hurry the others.
 
-    def __init__(self, folder: Path, rate: float, clock: Callable[[], int]) -> None:
-        self._files = sorted(p for p in folder.iterdir() if p.suffix.lower() in PICTURES)
-        if not self._files:
-            raise SourceError(f"no picture ({', '.join(sorted(PICTURES))}) in {folder}")
-        self._folder = folder
-        self._pace = _Pace(round(1e9 / rate))
+    Args:
+        pictures: one after the other.
+        rate: images a second.
+        clock: nanoseconds since the epoch.
+        ended: what to say when all have been played.
+    """
+
+    def __init__(
+        self,
+        pictures: Iterator[NDArray[np.uint8]],
+        rate: float,
+        clock: Callable[[], int],
+        ended: str,
+    ) -> None:
+        self._pictures = pictures
+        self._period = round(1e9 / rate)
         self._clock = clock
-        self._next = 0
+        self._ended = ended
+        self._due = 0
 
     def read(self) -> Grabbed | None:
         """Return the next picture once it is due."""
-        if self._next >= len(self._files):
-            raise SourceError(f"the {len(self._files)} pictures of {self._folder} have been played")
         now = self._clock()
-        if not self._pace.is_due(now):
+        if now < self._due:
             return None
-        path = self._files[self._next]
-        self._next += 1
-        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-        if image is None:
-            raise SourceError(f"{path} is no picture that OpenCV reads")
-        return Grabbed(np.asarray(image, dtype=np.uint8), now)
+        start = self._due if now - self._due < self._period else now
+        self._due = start + self._period
+        picture = next(self._pictures, None)
+        if picture is None:
+            raise ImageError(self._ended)
+        return Grabbed(picture, now)
 
     def close(self) -> None:
         """Nothing to release."""
 
 
-class VideoSource:
-    """Plays a video file at its own rate."""
+def _folder_source(folder: Path, rate: float, clock: Callable[[], int]) -> FileSource:
+    """Play the pictures of a folder in the order of their names."""
+    files = sorted(path for path in folder.iterdir() if path.suffix.lower() in PICTURES)
+    if not files:
+        raise ImageError(f"no picture ({', '.join(sorted(PICTURES))}) in {folder}")
+    ended = f"the {len(files)} pictures of {folder} have been played"
+    return FileSource(map(read_picture, files), rate, clock, ended)
 
-    def __init__(self, path: Path, clock: Callable[[], int]) -> None:
-        self._video = cv2.VideoCapture(str(path))
-        if not self._video.isOpened():
-            raise SourceError(f"{path} is no video that OpenCV reads")
-        self._path = path
-        rate = float(self._video.get(cv2.CAP_PROP_FPS))
-        self._pace = _Pace(round(1e9 / (rate if 0.1 < rate < 1000.0 else 30.0)))
-        self._clock = clock
 
-    def read(self) -> Grabbed | None:
-        """Return the next frame once it is due."""
-        now = self._clock()
-        if not self._pace.is_due(now):
-            return None
-        found, image = self._video.read()
+def _video_source(path: Path, clock: Callable[[], int]) -> FileSource:
+    """Play a video file at its own rate."""
+    video = cv2.VideoCapture(str(path))
+    if not video.isOpened():
+        raise ImageError(f"{path} is no video that OpenCV reads")
+    rate = float(video.get(cv2.CAP_PROP_FPS))
+    rate = rate if 0.1 < rate < 1000.0 else 30.0
+    return FileSource(_frames(video), rate, clock, f"the video {path} has been played")
+
+
+def _frames(video: Any) -> Iterator[NDArray[np.uint8]]:
+    """Yield the frames of a video that is open."""
+    while True:
+        found, image = video.read()
         if not found:
-            raise SourceError(f"the video {self._path} has been played")
-        return Grabbed(check_grey(image), now)
-
-    def close(self) -> None:
-        """Release the file."""
-        self._video.release()
+            return
+        yield check_grey(image)
 
 
 class DeviceSource:
@@ -284,7 +264,7 @@ class DeviceSource:
         self._capture = capture or _open_device
         self._video = self._open()
         if not self._video.isOpened():
-            raise SourceError(
+            raise ImageError(
                 f"cannot open the camera {name}: is it plugged in, free, and may you read it "
                 "(group video)?"
             )
@@ -296,10 +276,10 @@ class DeviceSource:
         self._thread.start()
 
     def read(self) -> Grabbed | None:
-        """Return the newest frame once; raises `SourceError` while the camera is gone."""
+        """Return the newest frame once; raises `ImageError` while the camera is gone."""
         with self._lock:
             if self._problem:
-                raise SourceError(self._problem)
+                raise ImageError(self._problem)
             newest, self._newest = self._newest, None
         return newest
 
@@ -335,7 +315,7 @@ class DeviceSource:
                 self._video = self._open()
 
 
-Source = FolderSource | VideoSource | DeviceSource
+Source = FileSource | DeviceSource
 """Something that gives images."""
 
 

@@ -17,9 +17,7 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
-import cv2
 import numpy as np
 import rclpy
 import yaml
@@ -38,7 +36,7 @@ from apriltag_tracker.camera.calibration import (
     calibrate_mounting,
     with_offsets,
 )
-from apriltag_tracker.camera.images import PICTURES, ImageError, to_grey
+from apriltag_tracker.camera.images import PICTURES, ImageError, ImageReader, read_picture
 from apriltag_tracker.sheets import SheetError, add_board_arguments, given_board
 from apriltag_tracker.tag_map import MapError, TagMap
 from limb_interfaces import qos
@@ -58,10 +56,7 @@ def from_files(paths: list[Path]) -> Iterator[Picture]:
     if not files:
         raise CalibrationError(f"no pictures in {', '.join(str(path) for path in paths)}")
     for file in files:
-        image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
-        if image is None:
-            raise CalibrationError(f"{file} is no picture that OpenCV reads")
-        yield file.name, np.asarray(image, dtype=np.uint8)
+        yield file.name, read_picture(file)
 
 
 def from_bag(path: Path, topic: str, every: float) -> Iterator[Picture]:
@@ -86,7 +81,8 @@ def from_bag(path: Path, topic: str, every: float) -> Iterator[Picture]:
             if stamp < due:
                 continue
             due = stamp + round(every * 1e9)
-            yield f"{stamp * 1e-9:.2f} s", _pixels(reader.deserialize(raw, link.msgtype))
+            picture = ImageReader().to_grey(reader.deserialize(raw, link.msgtype))
+            yield f"{stamp * 1e-9:.2f} s", picture
 
 
 def from_topic(topic: str, count: int, every: float) -> Iterator[Picture]:
@@ -106,15 +102,11 @@ def from_topic(topic: str, count: int, every: float) -> Iterator[Picture]:
                 if time.monotonic() > due + 10.0:
                     raise CalibrationError(f"no image on {topic} for 10 s: does the camera run?")
             print(f"picture {number + 1} of {count}: move the board", file=sys.stderr, flush=True)
-            yield f"picture {number + 1}", _pixels(came[-1])
+            yield f"picture {number + 1}", ImageReader().to_grey(came[-1])
     finally:
         node.destroy_node()
         with contextlib.suppress(Exception):
             rclpy.shutdown()
-
-
-def _pixels(message: Any) -> NDArray[np.uint8]:
-    return to_grey(message.data, message.height, message.width, message.step, message.encoding)
 
 
 def pictures(options: argparse.Namespace) -> Iterator[Picture]:

@@ -24,7 +24,7 @@ from sensor_msgs.msg import CameraInfo, Image
 from visualization_msgs.msg import MarkerArray
 
 from apriltag_tracker.camera import CameraError, Intrinsics
-from apriltag_tracker.camera.images import ImageError, to_grey
+from apriltag_tracker.camera.images import ImageError, ImageReader
 from apriltag_tracker.detection import Tag
 from apriltag_tracker.tag_map import TagMap
 from der_msgs.msg import (
@@ -236,10 +236,7 @@ class PageNode(Node):
             return
         message = deserialize_message(data, Image)
         try:
-            grey = to_grey(
-                message.data, message.height, message.width, message.step, message.encoding,
-                bool(message.is_bigendian),
-            )  # fmt: skip
+            grey = ImageReader().to_grey(message)
         except ImageError as error:
             self.get_logger().warning(str(error), throttle_duration_sec=10.0)
             return
