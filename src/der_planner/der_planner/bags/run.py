@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from der_planner.arrays import Array
+from der_planner.arrays import Array, interpolate
 from der_planner.methods import LEARNED
 
 
@@ -82,6 +82,10 @@ class Stream:
         """Return the samples from one time [s] to another one."""
         inside = (self.time >= first) & (self.time <= last)
         return Stream(self.time[inside], self.value[inside])
+
+    def at(self, instants: Array) -> Array:
+        """Return the values at instants (I,) [s], on straight lines between the samples."""
+        return interpolate(instants, self.time, self.value)
 
     @property
     def known(self) -> Stream:

@@ -303,7 +303,7 @@ class BagWriter:
         return f"fewer than {self._minimum_free >> 20} MiB are free where {self.folder} lies"
 
     def _write_metadata(self) -> None:
-        """Write ``metadata.yaml``, whole or not at all."""
+        """Write ``metadata.yaml``, whole or not at all; a folder that was removed stays so."""
         text = yaml.safe_dump({"rosbag2_bagfile_information": self._metadata()}, sort_keys=False)
         unfinished = self.folder / f".{METADATA_FILE}.part"
         unfinished.write_text(text, encoding="utf-8")

@@ -120,7 +120,6 @@ def _main(given: argparse.Namespace) -> int:
     lines = [report.text(), *(_held_out_text(limb, each, given.longest_gap) for each in unseen)]
     text = "\n".join([*lines, _weight(kept, given)])
     print(text)
-    given.out.parent.mkdir(parents=True, exist_ok=True)
     kept.to_yaml(given.out)
     print(f"limb file: {given.out}")
     if given.report:

@@ -92,7 +92,6 @@ def _update(limb: Limb, loaded: Limb, logs: list[CalibrationLog], out: Path | No
     elif out is None:
         print("nothing was written: name the updated limb file by --out FILE")
     else:
-        out.parent.mkdir(parents=True, exist_ok=True)
         dataclasses.replace(found, gravity=limb.gravity, masses=limb.masses).to_yaml(out)
         print(f"written: {out}")
     return 0 if said.enough else 3

@@ -16,7 +16,6 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-import os
 import platform
 import subprocess
 import sys
@@ -36,6 +35,7 @@ from der_planner.experiment.console import (
 from der_planner.experiment.offline_run import load_arrays, play_offline
 from der_planner.experiment.options import Options, Trial, TrialRun, parse
 from der_planner.experiment.processes import GraphError, NodeError
+from der_planner.files import write_whole
 from der_planner.identification import LogError, calibrate_twin
 from der_planner.limb import Limb, LimbError, mounting_of
 from der_planner.methods import LEARNED
@@ -191,12 +191,9 @@ class Ledger:
 
     def record(self, trial: Trial, result: dict[str, Any]) -> None:
         """Keep the result of a finished run."""
-        self._folder.mkdir(parents=True, exist_ok=True)
-        path = self._folder / f"{trial.name}.json"
-        unfinished = path.with_suffix(".part")
         settings = {**self._settings, "seed": trial.seed}
-        unfinished.write_text(json.dumps({"settings": settings, "result": result}, indent=1))
-        os.replace(unfinished, path)
+        text = json.dumps({"settings": settings, "result": result}, indent=1)
+        write_whole(self._folder / f"{trial.name}.json", text)
 
 
 def _digest(path: Path | None) -> str:
@@ -298,7 +295,6 @@ def _limb_file(trial: Trial, options: Options, progress: Progress) -> Path | Non
     progress.say(f"  calibrating on the twin of seed {trial.seed}")
     begin = time.monotonic()
     limb, _ = calibrate_twin(trial.seed, prior)
-    path.parent.mkdir(parents=True, exist_ok=True)
     limb.to_yaml(path)
     progress.say(f"  calibrated in {time.monotonic() - begin:.1f} s: {path}")
     return path

@@ -10,7 +10,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -21,6 +20,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from der_planner.files import write_whole
 from der_planner.limb.declaration import (
     LimbError,
     Parameter,
@@ -336,10 +336,7 @@ class Limb:
         """Write a limb file that `from_yaml` reads back as an equal limb, whole or not at all."""
         text = yaml.safe_dump(self.to_mapping(), sort_keys=False, allow_unicode=True)
         head = "# A limb, in SI units. How to choose each: the site, python3 scripts/docs.py\n"
-        file = Path(path)
-        unfinished = file.with_name(f".{file.name}.part")
-        unfinished.write_text(head + commented(text, sections()), encoding="utf-8")
-        os.replace(unfinished, file)
+        write_whole(path, head + commented(text, sections()))
 
 
 def sections() -> dict[str, dict[str, Parameter]]:

@@ -8,7 +8,6 @@ nor the motion; model and kinematics are built anew from them.
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +17,7 @@ import numpy as np
 import yaml
 
 from der_planner.arrays import Array
+from der_planner.files import write_whole
 from der_planner.limb import Limb, LimbError
 from der_planner.model import CONTROL_PERIOD, Model
 from der_planner.model.commands import within_limits
@@ -128,8 +128,6 @@ def write_plan(plan: Plan, path: str | Path, about: Mapping[str, Any] | None = N
         path: of the file.
         about: what else is worth knowing of it, e.g. how it was learned; kept as it is.
     """
-    file = Path(path)
-    file.parent.mkdir(parents=True, exist_ok=True)
     start = plan.reference.start
     content: dict[str, Any] = {
         "schema_version": SCHEMA_VERSION,
@@ -148,11 +146,9 @@ def write_plan(plan: Plan, path: str | Path, about: Mapping[str, Any] | None = N
     }
     if plan.chambers_beyond is not None:
         content["chambers_beyond_pa"] = plan.chambers_beyond.tolist()
-    unfinished = file.with_name(f".{file.name}.part")
     text = "# A plan, in SI units; row by row the setpoints, 50 ms apart.\n"
     text += yaml.safe_dump(content, sort_keys=False, default_flow_style=None)
-    unfinished.write_text(text, encoding="utf-8")
-    os.replace(unfinished, file)
+    write_whole(path, text)
 
 
 def read_plan(path: str | Path) -> Plan:

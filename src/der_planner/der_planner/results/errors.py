@@ -97,7 +97,7 @@ def error_series(run: RunSeries, settings: EvaluationSettings | None = None) -> 
     settings = settings or EvaluationSettings()
     lag = split_error(run, settings).lag_s if settings.remove_lag else 0.0
     tip = _seen(run, *window(run, settings), lag)
-    return ErrorSeries(tip.time, tip.value - interpolate(run.reference, tip.time))
+    return ErrorSeries(tip.time, tip.value - run.reference.at(tip.time))
 
 
 def _seen(run: RunSeries, first: float, last: float, lag: float = 0.0) -> Stream:
@@ -155,7 +155,7 @@ def split_error(run: RunSeries, settings: EvaluationSettings | None = None) -> S
         tip = _seen(run, first, last)
     time, measured = tip.time, tip.value
     lag = _best_lag(run.reference, time, measured, margin)
-    late = interpolate(run.reference, time - lag)
+    late = run.reference.at(time - lag)
     offset = (measured - late).mean(axis=0)
     gains, fitted = _fit_gains(late, measured)
     return Split(
@@ -172,7 +172,7 @@ def split_error(run: RunSeries, settings: EvaluationSettings | None = None) -> S
 
 def _best_lag(reference: Stream, time: Array, measured: Array, margin: float) -> float:
     def cost(lag: float) -> float:
-        _, fitted = _fit_gains(interpolate(reference, time - lag), measured)
+        _, fitted = _fit_gains(reference.at(time - lag), measured)
         return rms_distance(measured - fitted)
 
     if np.ptp(reference.value, axis=0).max() < STANDSTILL:
@@ -200,12 +200,6 @@ def _fit_gains(reference: Array, measured: Array) -> tuple[Array, Array]:
     return gains, fitted
 
 
-def interpolate(stream: Stream, time: Array) -> Array:
-    """Return the stream's columns at other times, linear between its samples."""
-    columns = [np.interp(time, stream.time, column) for column in stream.value.T]
-    return np.column_stack(columns)
-
-
 def check_tracker(tip: Stream, truth: Stream | None, first: float, last: float) -> dict[str, float]:
     """Compare tracked and simulated tip at the images' stamps between two times.
 
@@ -224,7 +218,7 @@ def check_tracker(tip: Stream, truth: Stream | None, first: float, last: float) 
     tip = tip.known.between(max(first, truth.time[0]), min(last, truth.time[-1]))
     if not len(tip):
         return {}
-    distance = np.linalg.norm(tip.value - interpolate(truth, tip.time), axis=1)
+    distance = np.linalg.norm(tip.value - truth.at(tip.time), axis=1)
     return {
         "tracker_rms_m": float(np.sqrt(np.mean(distance**2))),
         "tracker_max_m": float(distance.max()),

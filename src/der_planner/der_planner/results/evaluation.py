@@ -28,7 +28,6 @@ from der_planner.results.errors import (
     check_board,
     check_tracker,
     error_series,
-    interpolate,
     split_error,
     window,
 )
@@ -184,7 +183,7 @@ def _gaps(stamps: Array, valid: Array, first: float, last: float) -> tuple[int, 
 
 def _reference_points(run: RunSeries, first: float, last: float) -> tuple[tuple[float, float], ...]:
     """Return r̄ at evenly spaced instants of the window: enough to tell two references apart."""
-    points = interpolate(run.reference, np.linspace(first, last, REFERENCE_POINTS))
+    points = run.reference.at(np.linspace(first, last, REFERENCE_POINTS))
     return tuple((round(float(x), 6), round(float(y), 6)) for x, y in points)
 
 

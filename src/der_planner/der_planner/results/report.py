@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import html
 import json
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from functools import partial
@@ -14,6 +13,7 @@ from string import Template
 from typing import Any
 
 from der_planner.bags.run import RunSeries
+from der_planner.files import write_whole
 from der_planner.results.evaluation import DRAWN, RunResult, json_value
 from der_planner.results.figures import (
     plot_error,
@@ -61,13 +61,8 @@ def results_document(results: Sequence[RunResult]) -> dict[str, Any]:
 
 def write_results(results: Sequence[RunResult], folder: Path) -> Path:
     """Write ``results.json`` into a folder, whole or not at all, and return its path."""
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / "results.json"
-    unfinished = folder / ".results.json.part"
-    text = json.dumps(results_document(results), indent=1, allow_nan=False)
-    unfinished.write_text(text + "\n", encoding="utf-8")
-    os.replace(unfinished, path)
+    path = Path(folder) / "results.json"
+    write_whole(path, json.dumps(results_document(results), indent=1, allow_nan=False) + "\n")
     return path
 
 

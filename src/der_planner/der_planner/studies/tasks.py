@@ -144,15 +144,13 @@ def calibrated(twin: Twin, prior: str) -> str:
     folder = Path(os.environ.get("DER_LIMB_CACHE") or home) / "twins"
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{hashlib.sha256(about.encode()).hexdigest()[:32]}.yaml"
-    unfinished = path.with_suffix(".part")
     with path.with_suffix(".lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)  # it ends with a killed process
         if not path.exists():
             with threadpool_limits(1):  # more threads change the last digits
                 limb, _ = twin.fit(limb_of(prior))
             # What a fit took of the clock differs from run to run; the limb does not.
-            replace(limb, provenance={"source": f"{twin}"}).to_yaml(unfinished)
-            os.replace(unfinished, path)
+            replace(limb, provenance={"source": f"{twin}"}).to_yaml(path)
         return path.read_text(encoding="utf-8")
 
 
