@@ -5,8 +5,9 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
+from pressure_driver.protocols import FrameBuffer
 from pressure_driver.settings import EmulatorSettings
 
 
@@ -45,16 +46,26 @@ class BoardReading:
 
 
 class BoardProtocol(ABC):
-    """The firmware's end, for emulators and tests of firmware."""
+    """The firmware's end, for emulators and tests of firmware.
+
+    Args:
+        chamber_count: 2M.
+        frames: cuts what the host sends.
+    """
 
     gauge: ClassVar[bool] = False
     """Whether the wire carries pressures above the atmosphere."""
     pairwise: ClassVar[bool] = False
     """Whether the board reads a pair of pressures as a difference."""
 
-    def __init__(self, chamber_count: int = 4) -> None:
+    def __init__(self, chamber_count: int, frames: FrameBuffer) -> None:
         self.chamber_count = chamber_count
-        self.rejected = 0
+        self._frames = frames
+
+    @property
+    def rejected(self) -> int:
+        """Commands that were damaged or not understood."""
+        return self._frames.rejected
 
     def configure(self, settings: EmulatorSettings) -> None:  # noqa: B027 - most have none
         """Take over the parameters that are for this board alone."""
@@ -63,9 +74,20 @@ class BoardProtocol(ABC):
         """Return what the board says after power-up."""
         return b""
 
-    @abstractmethod
     def decode(self, data: bytes) -> list[BoardCommand]:
         """Take the next bytes from the host and return the commands that became complete."""
+        commands = []
+        for place, frame in self._frames.feed(data):
+            command = None if frame is None else self._interpret(place, frame)
+            if command is None:
+                self._frames.rejected += 1
+            else:
+                commands.append(command)
+        return commands
+
+    @abstractmethod
+    def _interpret(self, place: int, frame: Any) -> BoardCommand | None:
+        """Return the command in a frame whose first byte has this place; None: it is damaged."""
 
     def target(
         self,

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 from pressure_driver.emulator import BoardCommand, BoardProtocol, BoardReading
 from pressure_driver.emulator.polled import FestoBoard, PneudriveBoard
-from pressure_driver.protocols import LineSplitter
+from pressure_driver.protocols import LineSplitter, StreamCutter
 from pressure_driver.protocols.ctrlp import PASCAL_PER_KILOPASCAL
 from pressure_driver.protocols.ezloop import LARGEST_WIRE_VALUE, PASCAL_PER_HECTOPASCAL, numbers_of
 from pressure_driver.protocols.native import (
@@ -27,6 +27,8 @@ from pressure_driver.protocols.native import (
 
 UNITS = {"psi": 6894.757, "kPa": PASCAL_PER_KILOPASCAL}
 """[Pa] Units of a ctrlp board by the number of the command UNITS; it starts with psi."""
+LONGEST_LIST = 200
+"""[bytes] that an ezloop board takes for one command."""
 _COMMAND = re.compile(r"[A-Z]{2,12}(?:;-?\d{1,6}(?:\.\d{1,6})?)*")
 
 
@@ -34,13 +36,9 @@ class EzloopBoard(BoardProtocol):
     """The firmware's end of ``ezloop``."""
 
     pairwise = True
-    _BUFFER = 200
 
     def __init__(self, chamber_count: int = 4) -> None:
-        super().__init__(chamber_count)
-        self._position = 0
-        self._start = 0
-        self._body: bytearray | None = None
+        super().__init__(chamber_count, StreamCutter(b">", LONGEST_LIST))
 
     def boot(self, atmosphere: float) -> bytes:
         """Free text, as boards print it while they start."""
@@ -49,37 +47,16 @@ class EzloopBoard(BoardProtocol):
             f"room pressure {atmosphere / PASCAL_PER_HECTOPASCAL:.2f} hPa\r\nready\r\n"
         ).encode()
 
-    def decode(self, data: bytes) -> list[BoardCommand]:
+    def _interpret(self, place: int, piece: bytes) -> BoardCommand | None:
         """Return what stands between ``<`` and ``>``, if it is a list of admissible numbers."""
-        commands: list[BoardCommand] = []
-        for byte in data:
-            if byte == ord("<"):
-                if self._body is not None:
-                    self.rejected += 1
-                self._start, self._body = self._position, bytearray()
-            elif byte == ord(">") and self._body is not None:
-                command = self._parse(self._body.decode("latin-1"))
-                if command is None:
-                    self.rejected += 1
-                else:
-                    commands.append(command)
-                self._body = None
-            elif self._body is not None:
-                self._body.append(byte)
-                if len(self._body) > self._BUFFER:
-                    self.rejected += 1
-                    self._body = None
-            self._position += 1
-        return commands
-
-    def _parse(self, body: str) -> BoardCommand | None:
-        values = numbers_of(body, ",")
-        if values is None or len(values) != self.chamber_count:
+        before, bracket, body = piece.rpartition(b"<")
+        values = numbers_of(body.decode("latin-1"), ",")
+        if not bracket or values is None or len(values) != self.chamber_count:
             return None
         if not all(math.isfinite(value) and value <= LARGEST_WIRE_VALUE for value in values):
             return None
         pressure = tuple(value * PASCAL_PER_HECTOPASCAL for value in values)
-        return BoardCommand("setpoint", self._start, pressure=pressure)
+        return BoardCommand("setpoint", place + len(before), pressure=pressure)
 
     def telemetry(self, reading: BoardReading) -> bytes:
         """Three lines: chambers, reservoir, valves."""
@@ -95,8 +72,7 @@ class CtrlpBoard(BoardProtocol):
     gauge = True
 
     def __init__(self, chamber_count: int = 4) -> None:
-        super().__init__(chamber_count)
-        self._lines = LineSplitter()
+        super().__init__(chamber_count, LineSplitter())
         self.boot(0.0)
 
     def boot(self, atmosphere: float) -> bytes:  # noqa: ARG002 - it measures gauge pressure
@@ -106,17 +82,8 @@ class CtrlpBoard(BoardProtocol):
         self._reports = False
         return b"_pressure controller\n"
 
-    def decode(self, data: bytes) -> list[BoardCommand]:
-        """Return the commands of complete lines; the board understands small letters, too."""
-        commands = []
-        for place, line in self._lines.feed(data):
-            if line is None:
-                self.rejected += 1
-            else:
-                commands.append(self._parse(place, line.upper()))
-        return commands
-
-    def _parse(self, place: int, line: str) -> BoardCommand:
+    def _interpret(self, place: int, line: str) -> BoardCommand:
+        line = line.upper()  # the board understands small letters, too
         if _COMMAND.fullmatch(line):
             word, *arguments = line.split(";")
             numbers = [float(argument) for argument in arguments]
@@ -133,7 +100,7 @@ class CtrlpBoard(BoardProtocol):
             if word == "SET" and len(numbers) == self.chamber_count + 1:
                 self._setpoint = tuple(value * UNITS[self._unit] for value in numbers[1:])
                 return BoardCommand("setpoint", place, pressure=self._setpoint, text=line)
-        self.rejected += 1
+        self._frames.rejected += 1
         return BoardCommand("unknown", place, text=line)
 
     def telemetry(self, reading: BoardReading) -> bytes:
@@ -175,24 +142,13 @@ class NativeBoard(BoardProtocol):
         largest_pressure: int = 30_000,
         known: int = StatusFlag.SUPPLY_KNOWN | StatusFlag.VALVES_KNOWN,
     ) -> None:
-        super().__init__(chamber_count)
+        super().__init__(chamber_count, FrameSplitter())
         self._known = known
-        self._frames = FrameSplitter()
         self._largest = largest_pressure
         self._sequence = 0
 
-    def decode(self, data: bytes) -> list[BoardCommand]:
-        """Return HELLO, SETPOINT and VENT; a setpoint out of range comes back as ``refused``."""
-        commands = []
-        for place, frame in self._frames.feed(data):
-            command = self._interpret(place, frame) if frame else None
-            if command is None:
-                self.rejected += 1
-            else:
-                commands.append(command)
-        return commands
-
     def _interpret(self, place: int, frame: Frame) -> BoardCommand | None:
+        """Return HELLO, SETPOINT or VENT; a setpoint out of range comes back as ``refused``."""
         number, body = frame.sequence, frame.body
         if frame.type in (FrameType.HELLO, FrameType.VENT):
             kind = "hello" if frame.type is FrameType.HELLO else "vent"

@@ -49,8 +49,7 @@ class FestoBoard(BoardProtocol):
     gauge = True
 
     def __init__(self, chamber_count: int = 4) -> None:
-        super().__init__(chamber_count)
-        self._frames = festo.ModbusReader()
+        super().__init__(chamber_count, festo.ModbusReader())
         self._motion_terminal = True
         self.boot(0.0)
 
@@ -65,14 +64,8 @@ class FestoBoard(BoardProtocol):
         self._outputs = [0] * (3 * len(self.slots) or self.chamber_count)
         return b""
 
-    def decode(self, data: bytes) -> list[BoardCommand]:
-        """Return reads and writes; what is not there comes back as ``refused``."""
-        before = self._frames.rejected
-        commands = [self._interpret(place, frame) for place, frame in self._frames.feed(data)]
-        self.rejected += self._frames.rejected - before
-        return commands
-
     def _interpret(self, place: int, frame: festo.ModbusFrame) -> BoardCommand:
+        """Return a read or a write; what is not there comes back as ``refused``."""
         function, data, number = frame.function, frame.data, frame.transaction
         first, count = festo.BLOCK.unpack(data[:4].ljust(4, b"\0"))
         if function == festo.READ:
@@ -85,7 +78,7 @@ class FestoBoard(BoardProtocol):
                 slot.tell(word)
             told = self._setpoints()
             return BoardCommand("setpoint", place, told, BUS_PATIENCE, number, f"{first} {count}")
-        self.rejected += 1
+        self._frames.rejected += 1
         problem = ILLEGAL_ADDRESS if function == festo.WRITE else ILLEGAL_FUNCTION
         return BoardCommand("refused", place, sequence=number, text=f"{function} {problem}")
 
@@ -143,20 +136,18 @@ class PneudriveBoard(BoardProtocol):
     """The board's end of ``pneudrive``."""
 
     gauge = True
+    _frames: pneudrive.Frames
 
     def __init__(self, chamber_count: int = 4) -> None:
-        super().__init__(chamber_count)
-        self._frames = pneudrive.Frames(chamber_count)
+        super().__init__(chamber_count, pneudrive.Frames(chamber_count))
 
     def configure(self, settings: EmulatorSettings) -> None:
         """Take over the board's number and the range of its sensors."""
         self._frames.configure(settings)
 
-    def decode(self, data: bytes) -> list[BoardCommand]:
+    def _interpret(self, place: int, gauge: tuple[float, ...]) -> BoardCommand:
         """Return targets."""
-        frames = self._frames.feed(data)
-        self.rejected = self._frames.rejected
-        return [BoardCommand("setpoint", place, pressure=gauge) for place, gauge in frames]
+        return BoardCommand("setpoint", place, pressure=gauge)
 
     def target(self, pressure: Sequence[float], time: float) -> Sequence[float]:
         """Return the targets; nothing while the board starts."""

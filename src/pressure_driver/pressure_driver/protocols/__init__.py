@@ -12,7 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import import_module
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 if TYPE_CHECKING:
     from pressure_driver.settings import Settings
@@ -107,15 +107,19 @@ class BoardIdentity:
 Event = Telemetry | Echo | BoardFailure | BoardReset | BoardText | BoardIdentity
 
 
-class FrameBuffer:
-    """Bytes that are cut into frames or lines, and how often some were skipped."""
+class FrameBuffer(ABC):
+    """Bytes that are cut into frames or lines, and how often some were thrown away."""
 
     def __init__(self) -> None:
         self.rejected = 0
-        """Places at which bytes had to be skipped."""
+        """Places at which bytes had to be skipped, and frames or lines that were damaged."""
         self.position = 0
         """Of the first byte that is kept, in the stream."""
         self.kept = bytearray()
+
+    @abstractmethod
+    def feed(self, data: bytes) -> list[tuple[int, Any]]:
+        """Return (place of the first byte, frame) of what became complete; None for damage."""
 
     def take(self, count: int) -> bytes:
         """Return the first bytes and forget them."""
@@ -148,8 +152,8 @@ class StreamCutter(FrameBuffer):
         self._longest = longest
         self._overlong = False
 
-    def cut(self, data: bytes) -> list[tuple[int, bytes | None]]:
-        """Return (place of the first byte, piece without its end); None for one too long."""
+    def feed(self, data: bytes) -> list[tuple[int, Any]]:
+        """Return (place of the first byte, bytes without their end); None for too many."""
         pieces: list[tuple[int, bytes | None]] = []
         self.kept += data
         while (end := self.kept.find(self._end)) >= 0:
@@ -181,7 +185,7 @@ class LineSplitter(StreamCutter):
     def feed(self, data: bytes) -> list[tuple[int, str | None]]:
         """Return (place of the first byte, text) of the complete lines; None for a damaged one."""
         lines: list[tuple[int, str | None]] = []
-        for start, raw in self.cut(data):
+        for start, raw in super().feed(data):
             text = (raw or b"").strip()
             if raw is None or any(byte != 9 and not 32 <= byte < 127 for byte in text):
                 lines.append((start, None))
@@ -195,6 +199,7 @@ class HostProtocol(ABC):
 
     Args:
         chamber_count: 2M, at most 32.
+        frames: cuts what the board sends.
     """
 
     name: ClassVar[str]
@@ -219,19 +224,21 @@ class HostProtocol(ABC):
     """[s] steady."""
     room: Callable[[], float]
     """[Pa] absolute, of the atmosphere, where the wire wants absolute pressures."""
-    _frames: FrameBuffer
-    """Bytes that have been received by halves."""
 
-    def __init__(self, chamber_count: int = 4) -> None:
+    def __init__(self, chamber_count: int, frames: FrameBuffer) -> None:
         self.chamber_count = chamber_count
+        self._frames = frames
         self.clock, self.room = time.monotonic, lambda: STANDARD_ATMOSPHERE
-        self.rejected = 0
-        """Frames or lines that were damaged and thrown away."""
         self.last_damaged = ""
         """The newest of them, where the protocol has lines."""
         self.unsettled = ""
         """Why no pressure may be commanded yet, though the board talks; empty if it may."""
         self._follow_up = b""
+
+    @property
+    def rejected(self) -> int:
+        """Frames or lines that were damaged and thrown away."""
+        return self._frames.rejected
 
     def configure(self, settings: Settings) -> None:  # noqa: B027 - most boards have no parameters
         """Take over the parameters that are for this board alone."""
@@ -270,9 +277,18 @@ class HostProtocol(ABC):
         data, self._follow_up = self._follow_up, b""
         return data
 
-    @abstractmethod
     def decode(self, data: bytes) -> list[Event]:
         """Take the next bytes of the stream and return what became complete. Never raises."""
+        events: list[Event] = []
+        for _, frame in self._frames.feed(data):
+            found = [] if frame is None else self._interpret(frame)
+            self._frames.rejected += not found
+            events += found
+        return events
+
+    @abstractmethod
+    def _interpret(self, frame: Any) -> list[Event]:
+        """Return what a frame or a line says; nothing: it is damaged."""
 
     def reset(self) -> None:
         """Forget half-received bytes and what the board has said, as after a reconnect."""
@@ -283,20 +299,14 @@ class LineHost(HostProtocol):
     """The driver's end of a protocol whose board sends text lines."""
 
     def __init__(self, chamber_count: int = 4) -> None:
-        super().__init__(chamber_count)
-        self._frames: LineSplitter = LineSplitter()
+        super().__init__(chamber_count, LineSplitter())
 
-    def decode(self, data: bytes) -> list[Event]:
-        """Return what complete lines say; damaged lines are counted in ``rejected``."""
-        events: list[Event] = []
-        for _, line in self._frames.feed(data):
-            event = self._parse(line) if line else None
-            if event is not None:
-                events.append(event)
-                continue
-            self.rejected += 1
-            self.last_damaged = line[:LONGEST_SHOWN] if line else self.last_damaged
-        return events
+    def _interpret(self, line: str) -> list[Event]:
+        event = self._parse(line)
+        if event is None:
+            self.last_damaged = line[:LONGEST_SHOWN]
+            return []
+        return [event]
 
     @abstractmethod
     def _parse(self, line: str) -> Event | None:
@@ -308,7 +318,7 @@ def host_protocol(
 ) -> HostProtocol:
     """Return the driver's end of one of the `NAMES`; only its module is loaded."""
     module = import_module(f"pressure_driver.protocols.{name}")
-    host: type[HostProtocol] = getattr(module, f"{name.capitalize()}Host")
+    host: Callable[[int], HostProtocol] = getattr(module, f"{name.capitalize()}Host")
     protocol = host(chamber_count)
     if settings is not None:
         protocol.configure(settings)

@@ -143,9 +143,8 @@ class FestoHost(HostProtocol):
     resolution = PASCAL_PER_MILLIBAR
 
     def __init__(self, chamber_count: int = 4) -> None:
-        super().__init__(chamber_count)
+        super().__init__(chamber_count, ModbusReader())
         self._motion_terminal = True
-        self._frames: ModbusReader = ModbusReader()
         self._transaction = 0
         self.reset()
 
@@ -209,17 +208,6 @@ class FestoHost(HostProtocol):
         return encode(self._next(), WRITE, head + to_bytes(words))
 
     # ----------------------------------------------------------------------- from the terminal
-
-    def decode(self, data: bytes) -> list[Event]:
-        """Return what complete answers say; any other frame is counted in ``rejected``."""
-        before = self._frames.rejected
-        events: list[Event] = []
-        for _, frame in self._frames.feed(data):
-            found = self._interpret(frame)
-            self.rejected += not found
-            events += found
-        self.rejected += self._frames.rejected - before
-        return events
 
     def _interpret(self, frame: ModbusFrame) -> list[Event]:
         if frame.function == WRITE and len(frame.data) == BLOCK.size:

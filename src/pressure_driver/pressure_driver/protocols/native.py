@@ -123,7 +123,7 @@ class FrameSplitter(StreamCutter):
 
     def feed(self, data: bytes) -> list[tuple[int, Frame | None]]:
         """Return (place of the first byte, frame); None for one that is damaged or not known."""
-        return [(place, _read(coded)) for place, coded in self.cut(data) if coded != b""]
+        return [(place, _read(coded)) for place, coded in super().feed(data) if coded != b""]
 
 
 def _read(coded: bytes | None) -> Frame | None:
@@ -148,8 +148,7 @@ class NativeHost(HostProtocol):
     echoes = True
 
     def __init__(self, chamber_count: int = 4) -> None:
-        super().__init__(chamber_count)
-        self._frames: FrameSplitter = FrameSplitter()
+        super().__init__(chamber_count, FrameSplitter())
         self._sequence = 0
         self._board_time: int | None = None
         self._validity = VALIDITY
@@ -177,15 +176,6 @@ class NativeHost(HostProtocol):
         """Encode VENT, which holds until the next SETPOINT."""
         sequence = self._next()
         return encode(FrameType.VENT, sequence), sequence
-
-    def decode(self, data: bytes) -> list[Event]:
-        """Return what complete and sound frames say."""
-        events: list[Event] = []
-        for _, frame in self._frames.feed(data):
-            found = self._interpret(frame) if frame else []
-            self.rejected += not found
-            events += found
-        return events
 
     def _interpret(self, frame: Frame) -> list[Event]:
         if frame.type is FrameType.IDENTITY:

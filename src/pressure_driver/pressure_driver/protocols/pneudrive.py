@@ -85,10 +85,10 @@ class PneudriveHost(HostProtocol):
     )
     separator = b""
     echoes = True
+    _frames: Frames
 
     def __init__(self, chamber_count: int = 4) -> None:
-        super().__init__(chamber_count)
-        self._frames: Frames = Frames(chamber_count)
+        super().__init__(chamber_count, Frames(chamber_count))
         self.resolution = self._frames.resolution
 
     def configure(self, settings: Settings) -> None:
@@ -104,11 +104,7 @@ class PneudriveHost(HostProtocol):
         """Encode the targets."""
         return self._frames.encode(gauge), None
 
-    def decode(self, data: bytes) -> list[Event]:
+    def _interpret(self, gauge: tuple[float, ...]) -> list[Event]:
         """Return what was measured, and that a command was answered."""
-        room = self.assumed_atmosphere
-        events: list[Event] = []
-        for _, gauge in self._frames.feed(data):
-            events += [Echo(), Telemetry(chamber_pressure=tuple(room + p for p in gauge))]
-        self.rejected = self._frames.rejected
-        return events
+        readings = tuple(self.assumed_atmosphere + pressure for pressure in gauge)
+        return [Echo(), Telemetry(chamber_pressure=readings)]
