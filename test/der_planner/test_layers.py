@@ -10,6 +10,7 @@ ROOT = Path(der_planner.__file__).parent
 LAYERS = {
     "methods": 0,
     "arrays": 0,
+    "files": 0,
     "limb": 1,
     "rod": 2,
     "model": 3,
