@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from der_planner.arrays import Array
-from der_planner.rod import banded_kernel
+from der_planner.rod import banded_kernel, step_kernel
 from der_planner.rod.mesh import Mesh
 from der_planner.rod.step_kernel import Base, Body, Place, Record, Solver
 
@@ -81,12 +81,14 @@ class Piece(NamedTuple):
     record: Record  # the linearisation; only the solves of the steps done are filled
 
 
-class StepKernels(NamedTuple):
-    """The compiled functions of one kind of rod: those of its module `step_kernel`."""
+class Kernels(NamedTuple):
+    """The compiled functions of one kind of rod, by their names."""
 
     simulate: Callable[..., Any]
     newton: Callable[..., Any]
     linearise: Callable[..., Any]
+    energy: Callable[..., Any]
+    assemble: Callable[..., Any]
 
 
 class Backend(ABC):
@@ -106,7 +108,7 @@ class Backend(ABC):
         rod: the named tuple of numbers that the kernels take; a subclass fills it.
     """
 
-    kernels: StepKernels
+    kernels: Kernels
     unknowns_per_node: int
     turning_edges = 0
     lever = 0.0
@@ -142,6 +144,13 @@ class Backend(ABC):
     @abstractmethod
     def carry_frames(self, base: RodState, q: Array, v: Array) -> RodState:
         """Return a state at q whose frames are those of `base`, transported."""
+
+    @abstractmethod
+    def framed(self, state: RodState) -> tuple[Array, Any, Array]:
+        """Return the unknowns of a state, a work space of it, and its edges.
+
+        Each row of the edges, which are part of the work space, begins with the tangent.
+        """
 
     # ------------------------------------------------------------------------------ coordinates
 
@@ -269,17 +278,29 @@ class Backend(ABC):
         self.kernels.linearise(x, x, 0.0, u, columns, space, self.rod)
         return space.a, columns
 
-    @abstractmethod
     def energy(self, state: RodState) -> float:
         """Return the elastic energy [J]."""
+        x, space, _ = self.framed(state)
+        return float(self.kernels.energy(x, space, self.rod))
 
-    @abstractmethod
     def gradient_and_hessian(self, state: RodState) -> tuple[Array, Array]:
-        """Return ∇E (4N-1,) and ∇²E (4N-1, 4N-1), frames re-based at the state."""
+        """Return ∇E (4N-1,) and ∇²E (4N-1, 4N-1), frames re-based at the state.
 
-    @abstractmethod
+        Entries off a plane are zero.
+        """
+        x, space, _ = self.framed(state)
+        gradient, still = np.zeros((2, self.size))
+        unpressed = np.zeros(len(self.mesh.gain))
+        self.kernels.assemble(x, still, 0.0, unpressed, False, gradient, space, self.rod)
+        banded_kernel.expand(space.s, space.a)
+        return self.full(gradient), self.full_matrix(general_band_to_dense(space.a))
+
     def input_matrix(self, state: RodState) -> Array:
         """Return B(q)Λ (4N-1, M)."""
+        columns = np.zeros((self.size, len(self.mesh.gain)))
+        edges = self.framed(state)[2]
+        step_kernel.input_columns(edges, self.unknowns_per_node, self.rod, columns)
+        return self.full(columns)
 
 
 def general_band_to_dense(band: Array) -> Array:

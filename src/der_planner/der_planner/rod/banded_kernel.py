@@ -161,17 +161,3 @@ def solve_columns(a: Array, x: Array) -> None:
         inverse = a[i, b]
         for c in range(columns):
             x[i, c] *= inverse
-
-
-@kernel
-def solve_one(a: Array, x: Array) -> None:
-    """Solve L U y = x in place for one column x (n,)."""
-    n = a.shape[0]
-    b = (a.shape[1] - 1) // 2
-    for i in range(n):
-        for k in range(max(0, i - b), i):
-            x[i] -= a[i, k - i + b] * x[k]
-    for i in range(n - 1, -1, -1):
-        for k in range(i + 1, min(n, i + b + 1)):
-            x[i] -= a[i, k - i + b] * x[k]
-        x[i] *= a[i, b]

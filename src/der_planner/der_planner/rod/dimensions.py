@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from der_planner.arrays import Array
-from der_planner.rod.backend import Backend, RodState, StepKernels, general_band_to_dense
-from der_planner.rod.banded_kernel import expand
+from der_planner.rod.backend import Backend, Kernels, RodState
 from der_planner.rod.mesh import Mesh
 from der_planner.rod.planar import elastic_kernel as planar_elastic
 from der_planner.rod.planar import step_kernel as planar_step
@@ -15,7 +14,7 @@ from der_planner.rod.spatial import assembly_kernel as spatial_assembly
 from der_planner.rod.spatial import elastic_kernel as spatial_elastic
 from der_planner.rod.spatial import step_kernel as spatial_step
 from der_planner.rod.spatial.elastic_kernel import SpatialRod, SpatialSpace
-from der_planner.rod.step_kernel import Base, input_columns
+from der_planner.rod.step_kernel import Base
 
 _NO_FRAMES = Base(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
 
@@ -23,7 +22,10 @@ _NO_FRAMES = Base(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
 class PlanarBackend(Backend):
     """Kernels and arrays of a planar rod; frames do not matter there and stay as they are."""
 
-    kernels = StepKernels(planar_step.simulate, planar_step.newton, planar_step.linearise)
+    kernels = Kernels(
+        planar_step.simulate, planar_step.newton, planar_step.linearise,
+        planar_elastic.energy, planar_elastic.assemble,
+    )  # fmt: skip
     unknowns_per_node = 2
 
     def __init__(self, mesh: Mesh, plane: str) -> None:
@@ -64,32 +66,20 @@ class PlanarBackend(Backend):
         """Return a state at q with the frames of `base`."""
         return RodState(q, v, base.directors, base.reference_twist)
 
-    def energy(self, state: RodState) -> float:
-        """Return the elastic energy [J]."""
-        return float(planar_elastic.energy(self.unknowns(state.q), self.work_space(), self.rod))
-
-    def gradient_and_hessian(self, state: RodState) -> tuple[Array, Array]:
-        """Return ∇E (4N-1,) and ∇²E (4N-1, 4N-1); entries off the plane are zero."""
-        gradient, still = np.zeros((2, self.size))
-        u, space = np.zeros(len(self.mesh.gain)), self.work_space()
-        planar_elastic.assemble(
-            self.unknowns(state.q), still, 0.0, u, False, gradient, space, self.rod
-        )
-        expand(space.s, space.a)
-        return self.full(gradient), self.full_matrix(general_band_to_dense(space.a))
-
-    def input_matrix(self, state: RodState) -> Array:
-        """Return B(q)Λ (4N-1, M)."""
-        columns, space = np.zeros((self.size, len(self.mesh.gain))), self.work_space()
-        planar_elastic.edges_and_turns(self.unknowns(state.q), space.edge, space.turn)
-        input_columns(space.edge, 2, self.rod, columns)
-        return self.full(columns)
+    def framed(self, state: RodState) -> tuple[Array, PlanarSpace, Array]:
+        """Return the unknowns of a state, a work space of it, and its edges."""
+        x, space = self.unknowns(state.q), self.work_space()
+        planar_elastic.edges_and_turns(x, space.edge, space.turn)
+        return x, space, space.edge
 
 
 class SpatialBackend(Backend):
     """Kernels and arrays of a rod in space. With a ghost clamp one edge comes before its own."""
 
-    kernels = StepKernels(spatial_step.simulate, spatial_step.newton, spatial_step.linearise)
+    kernels = Kernels(
+        spatial_step.simulate, spatial_step.newton, spatial_step.linearise,
+        spatial_elastic.energy, spatial_assembly.assemble,
+    )  # fmt: skip
     unknowns_per_node = 4
 
     def __init__(self, mesh: Mesh) -> None:
@@ -111,7 +101,8 @@ class SpatialBackend(Backend):
         a, drag, turning = np.zeros((3, self.size, 21))
         return SpatialSpace(
             base=base, x=x, v=v, acceleration=acceleration, residual=residual, x_start=x_start,
-            v_start=v_start, base_start=np.zeros((n, 7)), s=np.zeros((self.size, 11)), a=a,
+            v_start=v_start, base_start=Base(*(part.copy() for part in base)),
+            s=np.zeros((self.size, 11)), a=a,
             drag=drag, turning=turning, frame=np.zeros((n - 1, 13)), twists=np.zeros(n),
             own=np.zeros((n - 1, 4, 5)), link=np.zeros((n, 4, 4)), local=np.zeros((12, 8)),
             vectors=np.zeros((10, 3)),
@@ -145,28 +136,9 @@ class SpatialBackend(Backend):
         spatial_step.carry(self.unknowns(q), space)
         return self.public_state(q, v, space.base, base)
 
-    def energy(self, state: RodState) -> float:
-        """Return the elastic energy [J]."""
-        return float(spatial_elastic.energy(*self._framed(state), self.rod))
-
-    def gradient_and_hessian(self, state: RodState) -> tuple[Array, Array]:
-        """Return ∇E (4N-1,) and ∇²E (4N-1, 4N-1) at a state, its frames re-based there."""
-        x, space = self._framed(state)
-        gradient, still = np.zeros((2, self.size))
-        u = np.zeros(len(self.mesh.gain))
-        spatial_assembly.assemble(x, still, 0.0, u, False, gradient, space, self.rod)
-        expand(space.s, space.a)
-        return self.full(gradient), self.full_matrix(general_band_to_dense(space.a))
-
-    def input_matrix(self, state: RodState) -> Array:
-        """Return B(q)Λ (4N-1, M)."""
-        columns = np.zeros((self.size, len(self.mesh.gain)))
-        input_columns(self._framed(state)[1].frame, 4, self.rod, columns)
-        return self.full(columns)
-
-    def _framed(self, state: RodState) -> tuple[Array, SpatialSpace]:
-        """Return the unknowns of a state and a work space with its frames and twists."""
+    def framed(self, state: RodState) -> tuple[Array, SpatialSpace, Array]:
+        """Return the unknowns of a state, a work space with its frames and twists, its edges."""
         x, space = self.unknowns(state.q), self.work_space(self.frames(state))
         spatial_elastic.frames(x, space.base, space.frame)
         spatial_elastic.reference_twists(space.frame, space.base.twists, space.twists)
-        return x, space
+        return x, space, space.frame

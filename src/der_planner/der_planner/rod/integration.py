@@ -179,8 +179,9 @@ def step_matrices(backend: Backend, solved: Solved) -> tuple[Array, Array]:
 
 @dataclass
 class _Journey:
-    """A run under way: its state and its recorded samples."""
+    """A run under way: its beginning, its state and its recorded samples."""
 
+    begin: RodState
     place: Place
     load: Array
     linearise: bool
@@ -218,7 +219,7 @@ class Integrator:
             dt * fraction, extrapolate, 1e-10 * self._length, backend.lever, limit=_LIMIT
         )
         intervals, steps, _ = pressures.shape
-        journey = _Journey(backend.place(state), load, linearise, method)
+        journey = _Journey(state, backend.place(state), load, linearise, method)
         x = np.empty((intervals + 1, backend.size))
         rate = np.empty((intervals + 1, backend.size))
         x[0], rate[0] = journey.place.x, journey.place.v
@@ -290,18 +291,13 @@ class Integrator:
     ) -> ConvergenceError:
         whole = solver.h / _STAGES[journey.method][0] * 2**allowed
         parts = f", also in {2**allowed} parts" if allowed else ""
-        place = self._backend.state(journey.place, _no_state(self._backend.mesh.nodes))
+        place = self._backend.state(journey.place, journey.begin)
         return ConvergenceError(
             f"step {step} of {whole:g} s ({journey.method}{parts}) did not converge in "
             f"{piece.failed_iterations} Newton iterations "
             f"(last update {piece.update:.3g} m): take a shorter step",
             step=step, residual=piece.update, iterations=piece.failed_iterations, state=place,
         )  # fmt: skip
-
-
-def _no_state(nodes: int) -> RodState:
-    zero = np.zeros(4 * nodes - 1)
-    return RodState(zero, zero, np.tile([0.0, 1.0, 0.0], (nodes - 1, 1)), np.zeros(nodes))
 
 
 def _joined(pieces: list[Solved]) -> Solved:

@@ -13,7 +13,7 @@ from der_planner.rod.banded_kernel import (
     put,
     smallest,
     solve_5,
-    solve_one,
+    solve_columns,
 )
 from der_planner.rod.compile import kernel
 from der_planner.rod.planar.elastic_kernel import (
@@ -61,7 +61,7 @@ def newton(
             unsymmetric(v, rate, u, space, rod)
             hold_rows(a, fixed, 1.0)
             factor_general(a)
-            solve_one(a, residual)
+            solve_columns(a, residual.reshape(size, 1))
         else:
             solve_5(s, residual)
         update = 0.0
@@ -109,14 +109,10 @@ def simulate(
         put(v_n, space.v_start)
         for stage in range(stages):
             predict(x, x_n, v_n, acceleration, solver.h, rod.body.fixed, far, False)
-            iterations = -1
-            update = np.inf
-            for attempt in range(2):
-                if attempt == 1:  # the guess may have been at fault: once more from rest
-                    put(x_n, x)
+            iterations, update = newton(x, x_n, v_n, rate, u, solver, space, rod)
+            if iterations < 0:  # the guess may have been at fault: once more from rest
+                put(x_n, x)
                 iterations, update = newton(x, x_n, v_n, rate, u, solver, space, rod)
-                if iterations > 0:
-                    break
             if iterations < 0:
                 put(space.x_start, x_n)
                 put(space.v_start, v_n)

@@ -49,7 +49,7 @@ class SpatialSpace(NamedTuple):
     residual: Array  # (4n-1,)
     x_start: Array  # (4n-1,) where a step began
     v_start: Array  # (4n-1,)
-    base_start: Array  # (n, 7) frames there
+    base_start: Base  # frames there
     s: Array  # (4n-1, 11) symmetric derivative of the residual, by columns
     a: Array  # (4n-1, 21) exact derivative, by rows
     drag: Array  # (4n-1, 21) derivative by −x_n without inertia, by rows

@@ -21,7 +21,7 @@ from der_planner.rod.banded_kernel import (
     put,
     smallest,
     solve_10,
-    solve_one,
+    solve_columns,
 )
 from der_planner.rod.compile import allocating_kernel, kernel
 from der_planner.rod.spatial.assembly_kernel import assemble, unsymmetric
@@ -62,23 +62,12 @@ def carry(x: Array, space: SpatialSpace) -> None:
 
 
 @kernel
-def save_base(base: Base, saved: Array) -> None:
-    """Copy the frames into saved (n, 7)."""
-    for j in range(base.tangents.shape[0]):
-        for k in range(3):
-            saved[j, k] = base.tangents[j, k]
-            saved[j, 3 + k] = base.directors[j, k]
-        saved[j, 6] = base.twists[j]
-
-
-@kernel
-def load_base(saved: Array, base: Base) -> None:
-    """Copy saved (n, 7) back into the frames."""
-    for j in range(base.tangents.shape[0]):
-        for k in range(3):
-            base.tangents[j, k] = saved[j, k]
-            base.directors[j, k] = saved[j, 3 + k]
-        base.twists[j] = saved[j, 6]
+def put_base(source: Base, target: Base) -> None:
+    """Copy the frames."""
+    for j in range(source.tangents.shape[0]):
+        put(source.tangents[j], target.tangents[j])
+        put(source.directors[j], target.directors[j])
+    put(source.twists, target.twists)
 
 
 @kernel
@@ -129,7 +118,7 @@ def newton(
             hold_fixed(s, residual, fixed)
             hold_rows(a, fixed, 1.0)
             factor_general(a)
-            solve_one(a, residual)
+            solve_columns(a, residual.reshape(size, 1))
         else:
             hold_fixed(s, residual, fixed)
             solve_10(s, residual)
@@ -177,21 +166,17 @@ def simulate(
         u = pressures[k, step]
         put(x_n, space.x_start)
         put(v_n, space.v_start)
-        save_base(base, space.base_start)
+        put_base(base, space.base_start)
         for stage in range(stages):
             predict(x, x_n, v_n, acceleration, solver.h, rod.body.fixed, far, True)
-            iterations = -1
-            update = np.inf
-            for attempt in range(2):
-                if attempt == 1:  # the guess may have been at fault: once more from rest
-                    put(x_n, x)
+            iterations, update = newton(x, x_n, v_n, rate, u, solver, space, rod)
+            if iterations < 0:  # the guess may have been at fault: once more from rest
+                put(x_n, x)
                 iterations, update = newton(x, x_n, v_n, rate, u, solver, space, rod)
-                if iterations > 0:
-                    break
             if iterations < 0:
                 put(space.x_start, x_n)
                 put(space.v_start, v_n)
-                load_base(space.base_start, base)
+                put_base(space.base_start, base)
                 return index, total - iterations, update, -iterations
             total += iterations
             extrapolate = solver.extrapolate[stage]
