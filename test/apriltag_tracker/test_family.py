@@ -42,12 +42,9 @@ def test_codes_differ_in_as_many_cells_as_stated_however_they_are_turned(each):
 
 
 @EACH
-def test_printed_cells_have_border_and_margin(each):
+def test_printed_cells_have_a_border(each):
     border = each.printed_cells(7)[each.rim : -each.rim, each.rim : -each.rim]
     assert set(border[0]) == set(border[:, -1]) == {int(each.outer_ring)}
-    assert each.printed_cells(7, margin=each.rim + 1)[0].min() == 1
-    with pytest.raises(ValueError, match="has a rim of"):
-        each.printed_cells(7, margin=each.rim - 1)
 
 
 @pytest.mark.parametrize("name", STANDARD)

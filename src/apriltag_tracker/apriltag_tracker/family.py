@@ -10,7 +10,6 @@ from __future__ import annotations
 import functools
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -79,15 +78,6 @@ class Family:
         """Cells along the edge of the sheet: half a one more on each side of an outer ring."""
         return self.tag_cells + float(self.outer_ring)
 
-    def dictionary(self) -> Any:
-        """Return OpenCV's dictionary of the family, or one of a single tag that nobody prints."""
-        if self.dictionary_id is not None:
-            return cv2.aruco.getPredefinedDictionary(self.dictionary_id)
-        cells = np.zeros((self.code_cells,) * 2, dtype=np.uint8)
-        return cv2.aruco.Dictionary(
-            cv2.aruco.Dictionary.getByteListFromBits(cells), self.code_cells, 0
-        )
-
     def rings(self) -> NDArray[np.int64]:
         """Tell in which ring each cell of a tag with its rim is, (n, n): 0 is the border."""
         across = np.arange(self.tag_cells)
@@ -107,30 +97,26 @@ class Family:
         """
         return _codes(self)
 
-    def printed_cells(self, tag: int, margin: int | None = None) -> NDArray[np.uint8]:
-        """Return the cells of one printed tag with its border and what is around it.
+    def printed_cells(self, tag: int) -> NDArray[np.uint8]:
+        """Return the cells of one printed tag with its rim.
 
         Args:
             tag: id within the family.
-            margin: cells around the border, white beyond the tag's rim; None for the rim alone.
 
         Returns:
-            (border_cells + 2 margin,) * 2 array of 0 (black) and 1 (white), upper row first.
+            (tag_cells,) * 2 array of 0 (black) and 1 (white), upper row first.
 
         Raises:
-            ValueError: no such tag in the family, or a margin that cuts the rim.
+            ValueError: no such tag in the family.
         """
         if not 0 <= tag < self.tag_count:
             raise ValueError(f"tag id {tag}: {self.name} has 0 to {self.tag_count - 1}")
-        beyond = 0 if margin is None else margin - self.rim
-        if beyond < 0:
-            raise ValueError(f"margin of {margin} cells: {self.name} has a rim of {self.rim}")
         mask = self.code_mask()
         inside = np.s_[self.rim : -self.rim, self.rim : -self.rim]
         cells = np.full(mask.shape, 0 if self.outer_ring else 1, dtype=np.uint8)
         cells[inside] = 1 if self.outer_ring else 0
         cells[mask] = self.codes()[tag]
-        return np.pad(cells, beyond, constant_values=1)
+        return cells
 
     def draw_tag(
         self, canvas: NDArray[np.uint8], tag: int, scale: int, left: int, top: int
@@ -167,7 +153,7 @@ def _codes(family: Family) -> NDArray[np.uint8]:
             packed = tables[family.name]
         return np.unpackbits(packed, axis=1, count=count)
     table = np.empty((family.tag_count, family.code_cells**2), dtype=np.uint8)
-    known = family.dictionary()
+    known = cv2.aruco.getPredefinedDictionary(family.dictionary_id)
     for tag in range(family.tag_count):
         stored = cv2.aruco.generateImageMarker(known, tag, family.border_cells)
         # OpenCV stores the codes turned by half a turn.

@@ -23,10 +23,9 @@ from apriltag_tracker.pipeline import (
     TrackerOptions,
     warm_up,
 )
-from apriltag_tracker.pose.node import LimbStateNode, camera_transform
+from apriltag_tracker.pose.node import LimbStateNode, transform
 from apriltag_tracker.reports import NO_CALIBRATION, ImageWatch, draw_observation
 from apriltag_tracker.tag_map import TagMap
-from apriltag_tracker.watching import StampGaps
 from der_msgs.msg import TagDetection
 from limb_interfaces import qos, stamps, topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
@@ -34,6 +33,8 @@ from limb_interfaces.parameters import check_overrides, declare
 from limb_interfaces.runner import run_node
 
 ANNOTATED_IMAGE = "camera/image_annotated"
+CAMERA_FRAME = "limb_camera"
+"""Name of the frame of a camera that names none: x right, y down, z out of the lens."""
 
 
 class TrackerNode(LimbStateNode):
@@ -54,7 +55,6 @@ class TrackerNode(LimbStateNode):
         check_overrides(self)
         # Every kernel is loaded or compiled before the first image.
         warm_up(self._detector)
-        self._gaps = StampGaps()
         self._tracker: LimbTracker | None = None
         self._reader = ImageReader()
         self._last_stamp = -1
@@ -155,7 +155,7 @@ class TrackerNode(LimbStateNode):
         try:
             gray = self._reader.to_grey(message)
         except ValueError as error:
-            self._watch.arrived()
+            self._watch.arrived(stamps.nanoseconds(message.header.stamp))
             self._fail(message.header.stamp, str(error))
             return
         self._process(gray, message.header.stamp)
@@ -173,14 +173,13 @@ class TrackerNode(LimbStateNode):
     def _process(self, gray: NDArray[np.uint8], stamp: Time) -> None:
         """Process one image and publish what it says under its own stamp."""
         started = time.perf_counter()
-        self._watch.arrived()
+        self._watch.arrived(stamps.nanoseconds(stamp))
         if stamps.nanoseconds(stamp) == self._last_stamp:
             # The same picture again says nothing new.
             self._watch.repeated += 1
             return
         self._last_stamp = stamps.nanoseconds(stamp)
         stamp = stamps.stamp_from_nanoseconds(self._last_stamp - self.sensor_delay)
-        self._gaps.take(self._last_stamp)
         if self._tracker is None:
             self._fail(stamp, self._watch.calibration_problem or NO_CALIBRATION)
             return
@@ -204,11 +203,10 @@ class TrackerNode(LimbStateNode):
         """Publish everything; returns the latency of the state [s]."""
         assert self._tracker is not None
         pose = self._tracker.world.pose
-        camera = (
-            []
-            if pose is None
-            else [camera_transform(pose.rotation, pose.translation, stamp, self._frame)]
-        )
+        camera = []
+        if pose is not None:
+            frame = self._frame or CAMERA_FRAME
+            camera = [transform(frame, pose.position, pose.rotation.T, stamp)]
         latency = self.publish_state(observation.estimate, observation.reason, stamp, camera)
         self.publish_tags([_tag_message(placed) for placed in observation.tags], stamp)
         if self._annotated.get_subscription_count() > 0:
@@ -226,16 +224,14 @@ class TrackerNode(LimbStateNode):
 
     def _health(self) -> Health:
         publishers = self.count_publishers(self._image_topic) if self._source is None else 0
-        report = self._watch.report(self._tracker, publishers)
-        if report.level != self._level:
-            self._level = report.level
-            if report.level == "ok":
-                self.get_logger().info(report.message)
+        level, message = self._watch.report(self._tracker, publishers)
+        if level != self._level:
+            self._level = level
+            if level == "ok":
+                self.get_logger().info(message)
             else:
-                self.get_logger().warning(report.message)
-        return Health(
-            report.level, report.message, {**report.values, "images_missed": self._gaps.missed}
-        )
+                self.get_logger().warning(message)
+        return Health(level, message, self._watch.tracking_values(self._tracker))
 
 
 def _tag_message(placed: PlacedTag) -> TagDetection:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from apriltag_tracker.camera import project
 from apriltag_tracker.pipeline import LimbObservation, LimbTracker
-from apriltag_tracker.watching import StreamReport, StreamWatch
+from apriltag_tracker.watching import StreamWatch
 
 NO_CALIBRATION = (
     "images come but no camera_info: publish it beside them, or set the parameter calibration_file "
@@ -54,23 +54,20 @@ class ImageWatch(StreamWatch):
         self.failed += 1
         self.image_problem = problem
 
-    def report(self, tracker: LimbTracker | None, publishers: int = 0) -> StreamReport:
-        """Say how things are.
+    def report(self, tracker: LimbTracker | None, publishers: int = 0) -> tuple[str, str]:
+        """Say how things are: the level (`ok`, `warning`, `error`, `stale`) and a sentence.
 
         Args:
             tracker: the tracker, None while there is no calibration.
             publishers: how many publish the image topic.
         """
-        values = self._values(tracker)
         if silence := self.silence():
-            level, message = self._silence(silence, publishers)
-        elif tracker is None:
-            level, message = "error", self.calibration_problem or NO_CALIBRATION
-        elif self.image_problem:
-            level, message = "error", self.image_problem
-        else:
-            level, message = self._tracking(tracker)
-        return StreamReport(level, message, values)
+            return self._silence(silence, publishers)
+        if tracker is None:
+            return "error", self.calibration_problem or NO_CALIBRATION
+        if self.image_problem:
+            return "error", self.image_problem
+        return self._tracking(tracker)
 
     def _silence(self, text: str, publishers: int) -> tuple[str, str]:
         level = self.silence_level
@@ -98,7 +95,8 @@ class ImageWatch(StreamWatch):
             )
         return ("warning", last.reason) if last.reason else ("ok", "tracking")
 
-    def _values(self, tracker: LimbTracker | None) -> dict[str, object]:
+    def tracking_values(self, tracker: LimbTracker | None) -> dict[str, object]:
+        """Return the numbers by name, those of the tracker too."""
         values = self.values()
         if tracker is not None:
             counts, world = tracker.tracker.counts, tracker.world

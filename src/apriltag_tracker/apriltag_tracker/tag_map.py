@@ -119,10 +119,6 @@ class TagMap(LimbGeometry):
         """Names of the limb's tags by their ids."""
         return {tag.id: str(tag.id) for tag in self.limb}
 
-    def world_tag(self, tag: int) -> WorldTag | None:
-        """Return the world tag with this id, or None."""
-        return next((entry for entry in self.world if entry.id == tag), None)
-
     @classmethod
     def from_yaml(cls, path: str | Path, family: str | None = None) -> TagMap:
         """Read a tag map.

@@ -5,7 +5,6 @@ from __future__ import annotations
 import collections
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -46,15 +45,6 @@ class StampGaps:
             self.missed += round(interval / period) - 1
 
 
-@dataclass(frozen=True)
-class StreamReport:
-    """Level (`ok`, `warning`, `error`, `stale`), a sentence, and numbers by name."""
-
-    level: str
-    message: str
-    values: dict[str, object]
-
-
 class StreamWatch:
     """Counts what comes and the states that are made of it, and tells of silence.
 
@@ -72,12 +62,14 @@ class StreamWatch:
         self.received = self.processed = self.failed = 0
         self.repeated = self.invalid = self.bridged = 0
         self._arrivals: collections.deque[float] = collections.deque(maxlen=_WINDOW)
+        self._gaps = StampGaps()
         self._latency: collections.deque[float] = collections.deque(maxlen=_WINDOW)
         self._work: collections.deque[float] = collections.deque(maxlen=_WINDOW)
 
-    def arrived(self) -> None:
-        """One came."""
+    def arrived(self, stamp: int) -> None:
+        """One came that has a stamp [ns]; zero: none."""
         self.received += 1
+        self._gaps.take(stamp)
         self._arrivals.append(self._clock())
 
     def counted(self, valid: bool, bridged: bool, latency: float, work: float) -> None:
@@ -106,6 +98,7 @@ class StreamWatch:
             f"{self._noun}s_received": self.received,
             f"{self._noun}s_processed": self.processed,
             f"{self._noun}s_failed": self.failed,
+            f"{self._noun}s_missed": self._gaps.missed,
             "repeated_stamps": self.repeated,
             "states_invalid": self.invalid,
             "states_bridged": self.bridged,

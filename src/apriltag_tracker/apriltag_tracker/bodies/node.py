@@ -14,7 +14,7 @@ from apriltag_tracker.bodies.forms import FORMS, PoseFormError, message_type, po
 from apriltag_tracker.bodies.tracker import BodyNoise, BodyTracker, FrameAssembler, PoseFrame
 from apriltag_tracker.pose.following import FollowerOptions
 from apriltag_tracker.pose.node import LimbStateNode
-from apriltag_tracker.watching import StampGaps, StreamWatch
+from apriltag_tracker.watching import StreamWatch
 from der_msgs.msg import TagDetection
 from limb_interfaces import qos, stamps
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
@@ -44,7 +44,6 @@ class PoseTrackerNode(LimbStateNode):
         self._bodies = BodyMap.from_yaml(self.map_path)
         self._tracker = BodyTracker(self._bodies, options, noise)
         self._assembler = FrameAssembler(self._bodies)
-        self._gaps = StampGaps()
         self._last = 0
         self._reason = self._problem = ""
         self.make_outputs(len(self._bodies.segment_lengths))
@@ -69,8 +68,7 @@ class PoseTrackerNode(LimbStateNode):
         """Follow the limb in a frame, if the last state is old enough, and publish it."""
         started = time.perf_counter()
         self._problem = ""
-        self._watch.arrived()
-        self._gaps.take(frame.stamp)
+        self._watch.arrived(frame.stamp)
         frame = frame._replace(stamp=frame.stamp - self.sensor_delay)
         # A frame that comes somewhat early is taken: rates of others are not quite even.
         if 0 <= frame.stamp - self._last < 0.9e9 * self._period:
@@ -95,7 +93,6 @@ class PoseTrackerNode(LimbStateNode):
         tracker, unknown = self._tracker, self._assembler.unknown
         values = {
             **self._watch.values(),
-            "frames_missed": self._gaps.missed,
             "unknown_bodies": dict(unknown),
             "bodies_misplaced": tracker.follower.misplaced,
             "base_residual_mm": f"{1e3 * tracker.base.residual:.2f}",

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from apriltag_tracker.camera.images import check_grey
 from apriltag_tracker.camera.pinhole import Intrinsics
-from apriltag_tracker.detection import Detector
 from apriltag_tracker.pipeline import LimbTracker
 from apriltag_tracker.sheets import BoardLayout
 from apriltag_tracker.tag_map import LimbTag, TagMap
@@ -50,7 +49,7 @@ class CameraCalibration:
     Attributes:
         intrinsics: the result.
         rms: reprojection error of all corners [px].
-        per_view: the same of each used picture, by name [px].
+        pictures: how many were used.
         left_out: pictures that did not fit, or showed too little, with the reason.
         sigma: standard deviations of fx, fy, cx, cy [px].
         covered: share of the picture's area in which corners were seen, in twelfths.
@@ -59,7 +58,7 @@ class CameraCalibration:
 
     intrinsics: Intrinsics
     rms: float
-    per_view: dict[str, float]
+    pictures: int
     left_out: dict[str, str]
     sigma: tuple[float, float, float, float]
     covered: float
@@ -136,7 +135,7 @@ def calibrate_camera(
             width, height, matrix, distortion, "rational_polynomial" if rational else "plumb_bob"
         ),
         rms=rms,
-        per_view={view.name: float(error) for view, error in zip(used, errors, strict=True)},
+        pictures=len(used),
         left_out=left_out,
         sigma=(float(sigma[0]), float(sigma[1]), float(sigma[2]), float(sigma[3])),
         covered=covered,
@@ -222,7 +221,7 @@ def calibrate_mounting(
     Raises:
         CalibrationError: no picture gave a camera pose, or a limb tag was never seen.
     """
-    tracker = LimbTracker(tags, intrinsics, detector=Detector(family=tags.family))
+    tracker = LimbTracker(tags, intrinsics)
     seen: dict[int, list[Array]] = {tag.id: [] for tag in tags.limb}
     count = 0
     for count, image in enumerate(images, 1):

@@ -75,19 +75,6 @@ def undistort_pixels(
     return out
 
 
-@njit(cache=True)
-def distort_to_pixels(
-    normalised: NDArray[np.float64], matrix: NDArray[np.float64], d: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return the pixels (n, 2) of normalised coordinates (n, 2)."""
-    out = np.empty_like(normalised)
-    for i in range(normalised.shape[0]):
-        xd, yd = distort(normalised[i, 0], normalised[i, 1], d)
-        out[i, 0] = matrix[0, 0] * xd + matrix[0, 1] * yd + matrix[0, 2]
-        out[i, 1] = matrix[1, 1] * yd + matrix[1, 2]
-    return out
-
-
 @dataclass(frozen=True)
 class Intrinsics:
     """Calibration of a camera.
@@ -197,9 +184,9 @@ class Intrinsics:
 
     def pixels(self, normalised: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return pixels (n, 2) of normalised coordinates (n, 2), lens distortion added."""
-        points = np.ascontiguousarray(normalised, dtype=np.float64).reshape(-1, 2)
-        result: NDArray[np.float64] = distort_to_pixels(points, self.matrix, self.distortion)
-        return result
+        points, still = np.column_stack([normalised, np.ones(len(normalised))]), np.zeros(3)
+        found, _ = cv2.projectPoints(points, still, still, self.matrix, self.distortion)
+        return np.asarray(found, dtype=np.float64).reshape(-1, 2)
 
 
 @dataclass(frozen=True)

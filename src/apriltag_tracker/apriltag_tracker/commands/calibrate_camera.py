@@ -145,7 +145,7 @@ def intrinsics(options: argparse.Namespace) -> None:
         f"\nfx {matrix[0, 0]:.2f} ± {sigma[0]:.2f}  fy {matrix[1, 1]:.2f} ± {sigma[1]:.2f}  "
         f"cx {matrix[0, 2]:.2f} ± {sigma[2]:.2f}  cy {matrix[1, 2]:.2f} ± {sigma[3]:.2f} px\n"
         f"distortion {np.round(result.intrinsics.distortion, 5).tolist()}\n"
-        f"error {result.rms:.3f} px over {len(result.per_view)} pictures, "
+        f"error {result.rms:.3f} px over {result.pictures} pictures, "
         f"corners cover {100 * result.covered:.0f} % of the image"
     )
     for name, why in result.left_out.items():

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apriltag_tracker.camera.images import check_grey
-from apriltag_tracker.detection.codes import UNREADABLE, code_table, nearest_tag, read_codes
+from apriltag_tracker.detection.codes import code_table, nearest_tag, read_codes
 from apriltag_tracker.detection.edges import refine_quads
 from apriltag_tracker.family import Family, FamilyError, named
 
@@ -212,8 +212,7 @@ class Detector:
         corners, covariances, residuals, found = refine_quads(image, quads, _SEARCH)
         misfits, codes = read_codes(image, corners, self.family)
         along, across = corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1]
-        good = found & (residuals <= _LARGEST_RESIDUAL) & (misfits < UNREADABLE)
-        good &= misfits <= self.family.largest_misfit
+        good = found & (residuals <= _LARGEST_RESIDUAL) & (misfits <= self.family.largest_misfit)
         # Corners run as printed, not as in a mirror; y points down in the image.
         turned = along[:, 0] * across[:, 1] - along[:, 1] * across[:, 0]
         good &= turned < 0.0

@@ -185,48 +185,35 @@ def _fit_side(
 
 
 @njit(cache=True)
-def _refine_once(
+def _refine(
     image: NDArray[np.uint8],
     corners: NDArray[np.float64],
     window: float,
     coarse: bool,
     sides: NDArray[np.float64],
 ) -> bool:
-    """Fit the four sides (4, 7) and move the corners to where they meet."""
+    """Fit the four sides (4, 7) and move the corners to where they meet, until they stay there."""
     area = 0.0
     for i in range(4):
         j = (i + 1) % 4
         area += corners[i, 0] * corners[j, 1] - corners[j, 0] * corners[i, 1]
     turn = 1.0 if area > 0.0 else -1.0
-    for i in range(4):
-        if not _fit_side(image, corners[i], corners[(i + 1) % 4], turn, window, coarse, sides[i]):
-            return False
-    for i in range(4):
-        before, after = sides[(i + 3) % 4], sides[i]
-        determinant = before[2] * after[3] - before[3] * after[2]
-        if abs(determinant) < 0.2:
-            return False
-        gx, gy = after[0] - before[0], after[1] - before[1]
-        reach = (gx * after[3] - gy * after[2]) / determinant
-        corners[i, 0] = before[0] + reach * before[2]
-        corners[i, 1] = before[1] + reach * before[3]
-    return True
-
-
-@njit(cache=True)
-def _refine_until(
-    image: NDArray[np.uint8],
-    corners: NDArray[np.float64],
-    window: float,
-    coarse: bool,
-    sides: NDArray[np.float64],
-) -> bool:
-    """Repeat passes until the corners stay where they are."""
     for _ in range(_COARSE_PASSES if coarse else _FINE_PASSES):
-        before = corners.copy()
-        if not _refine_once(image, corners, window, coarse, sides):
-            return False
-        if np.abs(corners - before).max() < (_NEAR if coarse else _SETTLED):
+        start = corners.copy()
+        for i in range(4):
+            end = start[(i + 1) % 4]
+            if not _fit_side(image, start[i], end, turn, window, coarse, sides[i]):
+                return False
+        for i in range(4):
+            before, after = sides[(i + 3) % 4], sides[i]
+            determinant = before[2] * after[3] - before[3] * after[2]
+            if abs(determinant) < 0.2:
+                return False
+            gx, gy = after[0] - before[0], after[1] - before[1]
+            reach = (gx * after[3] - gy * after[2]) / determinant
+            corners[i, 0] = before[0] + reach * before[2]
+            corners[i, 1] = before[1] + reach * before[3]
+        if np.abs(corners - start).max() < (_NEAR if coarse else _SETTLED):
             break
     return True
 
@@ -266,7 +253,7 @@ def refine_quads(
         fine = min(max(0.55 * cell, 1.1), 2.5)
         # A loop, since numba would compile a constant True and a constant False one by one.
         for coarse in (True, False):
-            found[i] = _refine_until(image, corners[i], wide if coarse else fine, coarse, sides)
+            found[i] = _refine(image, corners[i], wide if coarse else fine, coarse, sides)
             if not found[i]:
                 break
         if found[i]:

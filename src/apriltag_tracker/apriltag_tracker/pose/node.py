@@ -34,8 +34,6 @@ CLAMP_FRAME = "limb_clamp"
 """Name of the frame at the clamped end, which is the origin of `limb_base`."""
 TIP_FRAME = "limb_tip"
 """Name of the frame at the tip, x along the limb."""
-CAMERA_FRAME = "limb_camera"
-"""Name of the frame of a camera that names none: x right, y down, z out of the lens."""
 _MARKER_PERIOD = 0.1
 _Options = TypeVar("_Options", bound=FollowerOptions)
 
@@ -230,24 +228,6 @@ def limb_transforms(curve: NDArray[np.float64], stamp: Time) -> list[TransformSt
         transform(CLAMP_FRAME, (0.0, 0.0, 0.0), np.eye(3), stamp),
         transform(TIP_FRAME, (*curve[-1].tolist(), 0.0), tip, stamp),
     ]
-
-
-def camera_transform(
-    rotation: NDArray[np.float64],
-    translation: NDArray[np.float64],
-    stamp: Time,
-    frame: str = "",
-) -> TransformStamped:
-    """Return the place of a camera.
-
-    Args:
-        rotation: (3, 3) from `limb_base` into the camera's optical frame.
-        translation: (3,) m of the same: a point p of the base is at rotation p + translation.
-        stamp: of the image.
-        frame: name of the optical frame; `CAMERA_FRAME` if empty.
-    """
-    position = -rotation.T @ translation
-    return transform(frame or CAMERA_FRAME, position.tolist(), rotation.T, stamp)
 
 
 def transforms_type() -> Any:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from apriltag_tracker.camera import CameraError, CameraPose, Intrinsics, solve_pose
 from apriltag_tracker.detection import Tag
-from apriltag_tracker.tag_map import UNIT_CORNERS, TagMap, WorldTag
+from apriltag_tracker.tag_map import UNIT_CORNERS, TagMap
 
 _MEMORY = 150
 """Pictures over which corners are averaged."""
@@ -67,7 +67,7 @@ class WorldPose:
     """
 
     def __init__(self, tags: TagMap, intrinsics: Intrinsics) -> None:
-        self._map = tags
+        self._places = {tag.id: tag.corners() for tag in tags.world}
         self._intrinsics = intrinsics
         self._seen: dict[int, _Seen] = {}
         self._frames = 0
@@ -84,12 +84,12 @@ class WorldPose:
 
     def update(self, tags: Sequence[Tag]) -> CameraPose | None:
         """Take the fixed tags of one image and return the pose to use for it, None without one."""
-        known = [(tag, entry) for tag in tags if (entry := self._map.world_tag(tag.id)) is not None]
+        known = [tag for tag in tags if tag.id in self._places]
         if self._moved(known):
             self.bumps += 1
             self._seen.clear()
             self._frames = 0
-        for tag, _ in known:
+        for tag in known:
             seen = self._seen.get(tag.id)
             if seen is None:
                 self._seen[tag.id] = _Seen(tag.corners.copy(), tag.covariance.copy())
@@ -101,9 +101,9 @@ class WorldPose:
             self._frames += 1
         return self.pose
 
-    def _moved(self, known: Sequence[tuple[Tag, WorldTag]]) -> bool:
+    def _moved(self, known: Sequence[Tag]) -> bool:
         """Tell whether most fixed tags have been elsewhere than their mean for a few frames."""
-        averaged = [tag for tag, _ in known if tag.id in self._seen]
+        averaged = [tag for tag in known if tag.id in self._seen]
         if not averaged:
             return False
         gaps = np.array([tag.corners - self._seen[tag.id].corners for tag in averaged])
@@ -118,17 +118,12 @@ class WorldPose:
         return True
 
     def _solve(self) -> None:
-        entries = {
-            tag: entry for tag in self._seen if (entry := self._map.world_tag(tag)) is not None
-        }
-        ids = sorted(entries)
+        ids = sorted(self._seen)
         excluded: dict[int, float] = {}
         start = self.pose if self._frames > 0 else None
         while ids:
-            points = np.vstack([entries[tag].corners() for tag in ids])
-            pixels = np.vstack([self._seen[tag].corners for tag in ids])
             try:
-                pose, residuals = solve_pose(self._intrinsics, points, pixels, start)
+                pose, residuals = self._fit(ids, start)
             except CameraError as error:
                 self.pose, self.problem = None, str(error)
                 return
@@ -137,7 +132,7 @@ class WorldPose:
             if per_tag[worst] <= _MISFIT or len(ids) <= 2:
                 break
             # Out goes the tag without which the others agree best, not the one that shows it most.
-            worst = self._best_without(ids, entries)
+            worst = self._best_without(ids)
             excluded[ids[worst]] = float(per_tag[worst])
             del ids[worst]
             start = None
@@ -150,12 +145,19 @@ class WorldPose:
             return
         self.pose, self.excluded, self.problem = pose, excluded, ""
         self.residual = float(np.sqrt(np.mean(residuals**2)))
-        self.covariance = self._pose_covariance(pose, ids, points)
+        self.covariance = self._pose_covariance(pose, ids)
 
-    def _pose_covariance(
-        self, pose: CameraPose, ids: Sequence[int], points: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def _fit(
+        self, ids: Sequence[int], start: CameraPose | None = None
+    ) -> tuple[CameraPose, NDArray[np.float64]]:
+        """Solve the pose from some of the fixed tags; return as `solve_pose`, or raise the same."""
+        points = np.vstack([self._places[tag] for tag in ids])
+        pixels = np.vstack([self._seen[tag].corners for tag in ids])
+        return solve_pose(self._intrinsics, points, pixels, start)
+
+    def _pose_covariance(self, pose: CameraPose, ids: Sequence[int]) -> NDArray[np.float64]:
         """Carry the noise of the averaged corners over to the pose that fits them best, (6, 6)."""
+        points = np.vstack([self._places[tag] for tag in ids])
         seen = points @ pose.rotation.T + pose.translation
         lens, still = self._intrinsics, np.zeros(3)
         _, slopes = cv2.projectPoints(seen, still, still, lens.matrix, lens.distortion)
@@ -165,14 +167,12 @@ class WorldPose:
         result: NDArray[np.float64] = (parts @ spreads @ parts.swapaxes(1, 2)).sum(axis=0)
         return result
 
-    def _best_without(self, ids: Sequence[int], entries: dict[int, WorldTag]) -> int:
+    def _best_without(self, ids: Sequence[int]) -> int:
+        """Return the place among some fixed tags of the one without which the others agree best."""
         costs = []
         for left_out in range(len(ids)):
-            rest = [tag for i, tag in enumerate(ids) if i != left_out]
-            points = np.vstack([entries[tag].corners() for tag in rest])
-            pixels = np.vstack([self._seen[tag].corners for tag in rest])
             try:
-                _, residuals = solve_pose(self._intrinsics, points, pixels)
+                _, residuals = self._fit([*ids[:left_out], *ids[left_out + 1 :]])
                 costs.append(float(np.mean(residuals**2)))
             except CameraError:
                 costs.append(np.inf)
