@@ -16,11 +16,10 @@ from pathlib import Path
 import numpy as np
 
 from der_planner.arrays import Array
-from der_planner.commands.learn import FAILURES, add_plan_options, filmed, plan_of
+from der_planner.commands.learn import FAILURES, add_plan_options, in_hindsight, plan_of
 from der_planner.control.hindsight import Smoothed, smooth
 from der_planner.experiment.console import check_file, command_parser, run_command
-from der_planner.planning import Plan
-from der_planner.results import EvaluationError, RunSeries, load_run
+from der_planner.results import RunSeries, load_run
 
 
 def main() -> int:
@@ -38,30 +37,12 @@ def _estimate(given: argparse.Namespace) -> int:
     if given.out is not None:
         check_file(given.out)
     run = load_run(given.bag, namespace=given.namespace)
-    planned = plan_of(run, given)
-    smoothed = estimate_run(planned, run)
+    smoothed = in_hindsight(smooth, plan_of(run, given), run)
     print("\n".join(_said(smoothed, run)))
     if given.out is not None:
         write_table(smoothed, given.out)
         print(given.out)
     return 0
-
-
-def estimate_run(planned: Plan, run: RunSeries) -> Smoothed:
-    """Return the smoothed motion of a recorded run.
-
-    Args:
-        planned: the run's motion, for the limb that is to be judged.
-        run: recorded.
-
-    Raises:
-        LearningError: the run is of another motion.
-        EvaluationError: it holds no pictures or no measured pressures.
-    """
-    try:
-        return smooth(*filmed(planned, run))
-    except ValueError as error:
-        raise EvaluationError(f"{run.description.title}: {error}") from error
 
 
 def _said(smoothed: Smoothed, run: RunSeries) -> list[str]:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from der_planner.commands.learn import add_plan_options, filmed, plan_of
+from der_planner.commands.learn import FAILURES, add_plan_options, in_hindsight, plan_of
 from der_planner.control.hindsight import touches
 from der_planner.experiment.console import (
     Progress,
@@ -23,8 +23,6 @@ from der_planner.experiment.console import (
     run_command,
 )
 from der_planner.results import (
-    BagError,
-    EvaluationError,
     EvaluationSettings,
     RunSeries,
     compare,
@@ -92,7 +90,7 @@ def expand(paths: list[Path]) -> list[Path]:
 def main() -> int:
     """Run the command line; 0 when every bag was evaluated, 1 otherwise."""
     given = _arguments()
-    return run_command(lambda: _evaluate(given), BagError, EvaluationError, OSError)
+    return run_command(lambda: _evaluate(given), *FAILURES, OSError)
 
 
 def _evaluate(given: argparse.Namespace) -> int:
@@ -129,11 +127,7 @@ def _evaluate(given: argparse.Namespace) -> int:
 
 def _touched(run: RunSeries, given: argparse.Namespace) -> list[str]:
     """Return what touched the limb in a run, a line each."""
-    try:
-        found = touches(*filmed(plan_of(run, given), run))
-    except ValueError as error:
-        raise EvaluationError(f"{run.description.title}: {error}") from error
     return [
         f"touched from {each.since:.2f} to {end:.2f} s, surest at {each.time:.2f} s: {each.said}"
-        for each, end in found
+        for each, end in in_hindsight(touches, plan_of(run, given), run)
     ] or ["nothing touched the limb"]

@@ -13,8 +13,9 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -29,6 +30,7 @@ from der_planner.results import BagError, EvaluationError, RunSeries, load_run
 
 FAILURES = (BagError, EvaluationError, LearningError, LimbError, PlanningError)
 """What a bag, a limb file or a plan may be lacking."""
+Verdict = TypeVar("Verdict")
 _SAME_POINT = 2e-3
 """References whose points lie further apart than this [m] are not of one motion."""
 
@@ -56,7 +58,7 @@ def _learn(given: argparse.Namespace) -> int:
         said = f"mean error {last.mean_error * 100:.3f} cm; {last.reason}"
         print(f"{run.description.title}: {said}")
         judged = last.accepted and len(run.measured.known) > 0
-        for touch, end in touches(*filmed(first, run)) if judged else ():
+        for touch, end in in_hindsight(touches, first, run) if judged else ():
             print(
                 f"warning: something seems to touch the limb in it from {touch.since:.1f} to "
                 f"{end:.1f} s ({touch.said}): learn from runs that nothing touches",
@@ -142,13 +144,29 @@ def plan_of(run: RunSeries, given: argparse.Namespace) -> Plan:
     return plan(limb, motion, model=told.model, obstacles=in_the_way)
 
 
-def filmed(planned: Plan, run: RunSeries) -> tuple[Plan, Filmed]:
-    """Return the plan as it was played, and what camera and board showed of the run."""
+def in_hindsight(
+    judge: Callable[[Plan, Filmed], Verdict], planned: Plan, run: RunSeries
+) -> Verdict:
+    """Judge a recorded run by what camera and board showed of it.
+
+    Args:
+        judge: takes the plan as it was played, and what was filmed of it.
+        planned: the run's motion, for the limb that is to be judged.
+        run: recorded.
+
+    Raises:
+        LearningError: the run is of another motion.
+        EvaluationError: it holds no pictures or no measured pressures.
+    """
     check_same(planned, run)
     played = dataclasses.replace(planned, differential_pressure=run.setpoints.value)
-    return played, Filmed(
+    filmed = Filmed(
         run.measured.time, run.measured.value, run.tip.time, run.bend_angle.value, run.tip.value
     )
+    try:
+        return judge(played, filmed)
+    except ValueError as error:
+        raise EvaluationError(f"{run.description.title}: {error}") from error
 
 
 def check_same(planned: Plan, run: RunSeries) -> None:

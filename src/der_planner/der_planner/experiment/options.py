@@ -92,8 +92,9 @@ class Options:
 
     motions: tuple[str, ...] = _option(
         ("same_direction",),
-        f"of {', '.join(MOTIONS)}; all: the first three, which are the paper's",
+        "of %(choices)s; all: the first three, which are the paper's",
         nargs="+",
+        choices=(*MOTIONS, "all"),
         metavar="MOTION",
     )
     path: Path | None = _option(
@@ -106,8 +107,10 @@ class Options:
     nearest: bool = _option(
         False, "follow the nearest path that the limb can follow where --path leaves its reach"
     )
-    models: tuple[str, ...] = _option(MODELS, f"of {', '.join(MODELS)}", nargs="+", metavar="MODEL")
-    method: str = _option("optimal", f"of {', '.join(METHODS)}, for both models")
+    models: tuple[str, ...] = _option(
+        MODELS, "of %(choices)s", nargs="+", choices=MODELS, metavar="MODEL"
+    )
+    method: str = _option("optimal", "of both models", choices=METHODS)
     learn: int = _option(
         0,
         "after each trial, up to N more runs, each of the plan that was learned from the ones "
@@ -137,7 +140,7 @@ class Options:
         1, "of the first trial's twin; the next trial has the next seed", (0, 2**31 - 1000)
     )
     loads: Loads = field(default_factory=Loads)
-    board: str = _option(BOARDS[0], f"of the twin: of {', '.join(BOARDS)}", metavar="BOARD")
+    board: str = _option(BOARDS[0], "of the twin", choices=BOARDS)
     obstacles: Path | None = _option(
         None,
         "what is in the limb's way (YAML): plans keep off it, and the twin runs into it",
@@ -160,9 +163,8 @@ class Options:
     )
     reaction: Kind = _option(
         "yield",
-        f"of feedback to what touches the limb: {', '.join(KINDS)}; `yield` presses no harder than "
-        "the plan",
-        metavar="REACTION",
+        "of feedback to what touches the limb; `yield` presses no harder than the plan",
+        choices=KINDS,
     )
     force_limit: float = _option(
         0.0, "force [N] that `yield` allows, in place of the plan's; 0: the plan's", (0.0, 100.0)
@@ -298,25 +300,20 @@ def parse(arguments: Sequence[str]) -> Options:
     """Parse and check a command line.
 
     Raises:
-        OptionError: an unknown name, a number out of range or an unreadable file; says the choices.
-        SystemExit: after --help, or when argparse itself refuses.
+        OptionError: a number out of range, an unreadable file, or options that do not go together.
+        SystemExit: after --help, or when argparse itself refuses, as an unknown name.
     """
     given = parser().parse_args(arguments)
+    values: dict[str, Any] = {}
     for each in dataclasses.fields(Options):
-        value = getattr(given, each.name, None)
-        if value is not None and (within := each.metadata.get("within")):
-            least, most = within
-            if not least <= value <= most:
-                raise OptionError(
-                    f"--{each.name.replace('_', '-')} is {value}: choose {least} to {most}"
-                )
+        value = values[each.name] = getattr(given, each.name, None)
+        within = each.metadata.get("within")
+        if within and value is not None and not within[0] <= value <= within[1]:
+            name, (least, most) = each.name.replace("_", "-"), within
+            raise OptionError(f"--{name} is {value}: choose {least} to {most}")
     loads = Loads.given(given)
     motions = _motions(given)
     models = tuple(dict.fromkeys(given.models))
-    _check_names("model", models, MODELS)
-    _check_names("method", (given.method,), METHODS)
-    _check_names("board", (given.board,), BOARDS)
-    _check_names("reaction", (given.reaction,), KINDS)
     hardware = Hardware.from_yaml(given.hardware) if given.hardware else None
     limb = given.limb or (Path(hardware.limb) if hardware and hardware.limb else None)
     real = hardware is not None and hardware.twin is None
@@ -363,9 +360,6 @@ def parse(arguments: Sequence[str]) -> Options:
     ):
         if wrong:
             raise OptionError(said)
-    values: dict[str, Any] = {
-        each.name: getattr(given, each.name, None) for each in dataclasses.fields(Options)
-    }
     values |= {"motions": motions, "models": models, "loads": loads, "hardware": hardware}
     values |= {"limb": limb, "calibrate": limb is None and given.calibrate}
     if given.path is not None:
@@ -391,9 +385,7 @@ def _motions(given: argparse.Namespace) -> tuple[str, ...]:
         OptionError: the path cannot be read, or motions are asked for beside it.
     """
     if given.path is None:
-        names = JOINT_MOTIONS if list(given.motions) == ["all"] else given.motions
-        _check_names("motion", names, (*MOTIONS, "all"))
-        return tuple(dict.fromkeys(names))
+        return JOINT_MOTIONS if given.motions == ["all"] else tuple(dict.fromkeys(given.motions))
     if isinstance(given.motions, list):  # the default is a tuple
         raise OptionError("--path is drawn in place of --motions: give one of the two")
     try:
@@ -401,9 +393,3 @@ def _motions(given: argparse.Namespace) -> tuple[str, ...]:
     except PlanningError as error:
         raise OptionError(f"--path: {error}") from error
     return (re.sub(r"[^A-Za-z0-9-]+", "_", given.path.stem).strip("_") or "path",)
-
-
-def _check_names(kind: str, names: Sequence[str], known: Sequence[str]) -> None:
-    for name in names:
-        if name not in known:
-            raise OptionError(f"unknown {kind} '{name}': choose of {', '.join(known)}")
