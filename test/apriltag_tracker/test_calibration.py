@@ -192,8 +192,8 @@ def test_pictures_come_from_a_bag(tmp_path):
         (["intrinsics", "--out", "x.yaml"], "--topic or --bag"),
         (["intrinsics", "--bag", "/nowhere.mcap", "--out", "x.yaml"], "/nowhere.mcap"),
         (["mounting", "--calibration", "/nowhere.yaml", "--out", "x.yaml"], "/nowhere.yaml"),
-        (["intrinsics", "none", "--out", "."], "is a folder: name a file"),
-        (["intrinsics", "none", "--out", "missing/camera.yaml"], "is no folder"),
+        (["intrinsics", "none", "--out", "."], "cannot be written: Is a directory"),
+        (["intrinsics", "none", "--out", "missing/camera.yaml"], "cannot be written: No such file"),
         (["intrinsics", "none", "--out", "/proc/camera.yaml"], "cannot be written"),
     ],
 )

@@ -69,7 +69,7 @@ def test_a_damaged_table_of_standard_codes_is_noticed(monkeypatch):
     damaged = np.roll(each.codes(), 1, axis=1)
     monkeypatch.setattr(family, "_codes", lambda _: damaged)
     monkeypatch.setattr(detector, "_CHECKED", set())
-    with pytest.raises(family.FamilyError, match=r"standard_families\.npz is damaged"):
+    with pytest.raises(family.FamilyError, match="or damaged"):
         Detector(family=each)
 
 

@@ -34,8 +34,8 @@ def _set(*path, value):
     ("change", "message"),
     [
         (_set("schema", value=9), "schema"),
-        (_set("family", value="tagCustom48h12"), "a hole in the middle.*tag36h11, tag36h10"),
-        (_set("family", value="tag16h5"), "one of 0 to 29, which tag16h5 has"),
+        (_set("family", value="tagCustom48h12"), "tagCustom48h12.*tag36h11, tag36h10"),
+        (_set("family", value="tag16h5"), "none of 0 to 29, which tag16h5 has"),
         (_set("limb", "segment_lengths", value=[0.1, -0.1]), "segment_lengths"),
         (_set("limb", "tags", value=[]), "at least one"),
         (_set("limb", "tags", 0, "id", value=700), "700"),

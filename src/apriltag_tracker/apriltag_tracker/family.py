@@ -136,12 +136,10 @@ class Family:
         value = int("".join(str(bit) for bit in self.codes()[0]), 2)
         if value == self.first_code:
             return
-        wrong = f"tag 0 of {self.name} reads {value:#x} and not {self.first_code:#x}"
-        if self.dictionary_id is None:
-            raise FamilyError(f"{wrong}: {_STANDARD_CODES} is damaged; install the package again")
         raise FamilyError(
-            f"{wrong} in OpenCV {cv2.__version__}: its dictionary is turned in another way than "
-            "this package knows; install opencv-python-headless 4.14 or 5.0"
+            f"tag 0 of {self.name} reads {value:#x} and not {self.first_code:#x} with OpenCV "
+            f"{cv2.__version__}: its codes are turned in another way than this package knows, or "
+            "damaged; install the package and opencv-python-headless 4.14 or 5.0 again"
         )
 
 
@@ -184,8 +182,4 @@ def named(name: object) -> Family:
     """
     if isinstance(name, str) and name in FAMILIES:
         return FAMILIES[name]
-    there = ", ".join(FAMILIES)
-    why = ""
-    if isinstance(name, str) and name.lower().startswith(("tagcircle", "tagcustom")):
-        why = "its tags are round or have a hole in the middle, which nothing here reads; "
-    raise ValueError(f"family '{name}': {why}there are {there}")
+    raise ValueError(f"family '{name}' is not read here: there are {', '.join(FAMILIES)}")

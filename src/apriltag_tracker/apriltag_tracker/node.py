@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import array
 import time
-from dataclasses import replace
+from dataclasses import astuple, replace
 
 import cv2
 import numpy as np
@@ -64,7 +64,8 @@ class TrackerNode(LimbStateNode):
         self._watch = ImageWatch(
             self._image_topic if source == "topic" else source, is_topic=source == "topic"
         )
-        self._make_topics()
+        self.make_outputs(len(self._map.segment_lengths))
+        self._annotated = self.create_publisher(Image, ANNOTATED_IMAGE, qos.SENSOR_DATA)
         if calibration:
             self._set_calibration(Intrinsics.from_yaml(str(calibration)))
         self._source: Source | None = None
@@ -112,10 +113,6 @@ class TrackerNode(LimbStateNode):
         bits = self.number("correct_bits", family.correct_bits, forgiven, 0, family.most_corrected)
         return Detector(shortest, int(bits), family=family)
 
-    def _make_topics(self) -> None:
-        self.make_outputs(len(self._map.segment_lengths))
-        self._annotated = self.create_publisher(Image, ANNOTATED_IMAGE, qos.SENSOR_DATA)
-
     def _subscribe(self, needs_info: bool) -> None:
         # A best-effort subscriber hears best-effort and reliable publishers alike.
         self.create_subscription(Image, topics.IMAGE, self._on_image, qos.IMAGES)
@@ -140,14 +137,10 @@ class TrackerNode(LimbStateNode):
     def _set_calibration(self, intrinsics: Intrinsics) -> None:
         """Take a calibration; one that is like the present one changes nothing."""
         self._watch.calibration_problem = ""
-        now = self._tracker.intrinsics if self._tracker is not None else None
-        if (
-            now is not None
-            and (now.width, now.height) == (intrinsics.width, intrinsics.height)
-            and np.array_equal(now.matrix, intrinsics.matrix)
-            and np.array_equal(now.distortion, intrinsics.distortion)
-        ):
-            return
+        if self._tracker is not None:
+            now = astuple(self._tracker.intrinsics)
+            if all(map(np.array_equal, now, astuple(intrinsics))):
+                return
         self._tracker = LimbTracker(self._map, intrinsics, self._options, self._detector)
 
     def _on_image(self, message: Image) -> None:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from apriltag_tracker import family as families
 from apriltag_tracker.family import TAG36H11, Family
+from apriltag_tracker.pose.curve import Curve
 
 SCHEMA_VERSION = 1
 
@@ -108,6 +109,11 @@ class TagMap(LimbGeometry):
             raise MapError(
                 f"tag ids {twice} occur twice in the tag map: every tag needs its own id"
             )
+        count = self.family.tag_count
+        if foreign := [tag for tag in self.ids if not 0 <= tag < count]:
+            raise MapError(
+                f"tag ids {foreign} are none of 0 to {count - 1}, which {self.family.name} has"
+            )
 
     @property
     def ids(self) -> tuple[int, ...]:
@@ -120,23 +126,13 @@ class TagMap(LimbGeometry):
         return {tag.id: str(tag.id) for tag in self.limb}
 
     @classmethod
-    def from_yaml(cls, path: str | Path, family: str | None = None) -> TagMap:
+    def from_yaml(cls, path: str | Path) -> TagMap:
         """Read a tag map.
-
-        Args:
-            path: of the file.
-            family: name of the tags' family, None for the one that the file names.
 
         Raises:
             MapError: the file is missing, is no YAML, or a key is missing or impossible.
         """
-
-        def build(data: Any) -> TagMap:
-            if family is not None and isinstance(data, dict):
-                data["family"] = family
-            return cls.from_dict(data)
-
-        return read_map(path, build)
+        return read_map(path, cls.from_dict)
 
     @classmethod
     def from_dict(cls, data: Any) -> TagMap:
@@ -151,10 +147,10 @@ class TagMap(LimbGeometry):
         world = section(data, "world")
         lengths, stiff = limb_geometry(limb)
         total = sum(lengths)
-        limb_tags = tuple(_limb_tag(entry, total, family) for entry in limb.get("tags") or [])
+        limb_tags = tuple(_limb_tag(entry, total) for entry in limb.get("tags") or [])
         if not limb_tags:
             raise MapError("limb.tags is empty: at least one tag must be on the limb")
-        world_tags = tuple(_world_tag(entry, family) for entry in world.get("tags") or [])
+        world_tags = tuple(_world_tag(entry) for entry in world.get("tags") or [])
         return cls(lengths, limb_tags, world_tags, family, stiff=stiff)
 
 
@@ -228,26 +224,17 @@ def _stiff(value: Any, lengths: tuple[float, ...]) -> tuple[tuple[float, float],
         if not (result[-1][1] if result else 0.0) <= start < end <= sum(lengths) + 1e-9:
             raise MapError(f"limb.stiff: {entry} is out of order or not on the limb")
         result.append((start, end))
-    begin = 0.0
-    for length in lengths:
-        covered = sum(
-            max(0.0, min(end, begin + length) - max(start, begin)) for start, end in result
-        )
-        if covered > 0.5 * length:
-            raise MapError("limb.stiff covers more than half of a segment: nothing could bend")
-        begin += length
+    if np.any(Curve(lengths, 0, result).active < 0.5 * np.array(lengths)):
+        raise MapError("limb.stiff covers more than half of a segment: nothing could bend")
     return tuple(result)
 
 
-def _common(entry: Any, where: str, family: Family) -> tuple[int, float, str]:
+def _common(entry: Any, where: str) -> tuple[int, float, str]:
     if not isinstance(entry, dict):
         raise MapError(f"{where}: an entry 'id: …, size: …' expected, not {entry!r}")
     tag = entry.get("id")
-    if not isinstance(tag, int) or not 0 <= tag < family.tag_count:
-        raise MapError(
-            f"{where}: id {tag!r} is not one of 0 to {family.tag_count - 1}, which "
-            f"{family.name} has"
-        )
+    if not isinstance(tag, int):
+        raise MapError(f"{where}: id {tag!r} is no whole number")
     name = f"{where} {tag}"
     size = number(entry.get("size"), f"{name}: size")
     if size <= 0.0:
@@ -255,14 +242,14 @@ def _common(entry: Any, where: str, family: Family) -> tuple[int, float, str]:
     return tag, size, name
 
 
-def _limb_tag(entry: Any, total: float, family: Family) -> LimbTag:
-    tag, size, name = _common(entry, "limb tag", family)
+def _limb_tag(entry: Any, total: float) -> LimbTag:
+    tag, size, name = _common(entry, "limb tag")
     arc_length, height, offset = on_limb(entry, total, name)
     return LimbTag(tag, arc_length, height, size, offset)
 
 
-def _world_tag(entry: Any, family: Family) -> WorldTag:
-    tag, size, name = _common(entry, "world tag", family)
+def _world_tag(entry: Any) -> WorldTag:
+    tag, size, name = _common(entry, "world tag")
     position = floats(entry.get("position"), 3, f"{name}: position")
     yaw = number(entry.get("yaw", 0.0), f"{name}: yaw")
     return WorldTag(tag, (position[0], position[1], position[2]), yaw, size)

@@ -51,7 +51,7 @@ class CameraCalibration:
         rms: reprojection error of all corners [px].
         pictures: how many were used.
         left_out: pictures that did not fit, or showed too little, with the reason.
-        sigma: standard deviations of fx, fy, cx, cy [px].
+        sigma: (4,) standard deviations of fx, fy, cx, cy [px].
         covered: share of the picture's area in which corners were seen, in twelfths.
         remarks: what would make it better.
     """
@@ -60,7 +60,7 @@ class CameraCalibration:
     rms: float
     pictures: int
     left_out: dict[str, str]
-    sigma: tuple[float, float, float, float]
+    sigma: Array
     covered: float
     remarks: list[str] = field(default_factory=list)
 
@@ -137,7 +137,7 @@ def calibrate_camera(
         rms=rms,
         pictures=len(used),
         left_out=left_out,
-        sigma=(float(sigma[0]), float(sigma[1]), float(sigma[2]), float(sigma[3])),
+        sigma=sigma[:4],
         covered=covered,
         remarks=_remarks(covered, spread, rms),
     )
@@ -177,14 +177,7 @@ def _solve(
     normals = np.array([cv2.Rodrigues(rotation)[0][:, 2] for rotation in rotations])
     tilts = np.arctan2(normals[:, :2], np.abs(normals[:, 2:3])) * np.sign(normals[:, 2:3])
     count = 8 if rational else 5
-    return (
-        float(rms),
-        np.asarray(matrix, dtype=np.float64),
-        np.asarray(distortion, dtype=np.float64).ravel()[:count],
-        tilts,
-        np.asarray(sigma, dtype=np.float64).ravel(),
-        np.asarray(errors, dtype=np.float64).ravel(),
-    )
+    return rms, matrix, distortion.ravel()[:count], tilts, sigma.ravel(), errors.ravel()
 
 
 def _coverage(views: Sequence[BoardView], width: int, height: int) -> float:
@@ -200,13 +193,13 @@ class MountingCalibration:
     """Mounting of every tag, by id.
 
     Attributes:
-        offsets: along, across [m], turn [rad].
-        scatter: their standard deviations between pictures.
+        offsets: (3,) along, across [m], turn [rad].
+        scatter: (3,) their standard deviations between pictures.
         pictures: how many there were.
     """
 
-    offsets: dict[int, tuple[float, float, float]]
-    scatter: dict[int, tuple[float, float, float]]
+    offsets: dict[int, Array]
+    scatter: dict[int, Array]
     pictures: int
 
 
@@ -237,10 +230,8 @@ def calibrate_mounting(
     offsets, scatter = {}, {}
     for tag in tags.limb:
         poses = np.array(seen[tag.id])
-        mean = np.median(poses, axis=0) - (tag.arc_length, 0.0, 0.0)
-        spread = poses.std(axis=0)
-        offsets[tag.id] = (float(mean[0]), float(mean[1]), float(mean[2]))
-        scatter[tag.id] = (float(spread[0]), float(spread[1]), float(spread[2]))
+        offsets[tag.id] = np.median(poses, axis=0) - (tag.arc_length, 0.0, 0.0)
+        scatter[tag.id] = poses.std(axis=0)
     return MountingCalibration(offsets, scatter, count)
 
 

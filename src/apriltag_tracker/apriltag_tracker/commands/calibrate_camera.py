@@ -180,10 +180,6 @@ def _check_output(path: Path) -> None:
     Raises:
         CalibrationError: it is a folder, its folder is missing, or there is no right to write.
     """
-    if path.is_dir():
-        raise CalibrationError(f"--out {path} is a folder: name a file")
-    if not path.parent.is_dir():
-        raise CalibrationError(f"--out {path} cannot be written: {path.parent} is no folder")
     present = path.exists()
     try:
         path.open("ab").close()

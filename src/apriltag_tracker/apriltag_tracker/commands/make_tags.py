@@ -7,6 +7,7 @@ python3 scripts/make_tags.py board --paper letter --out sheets/
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import sys
 from pathlib import Path
 
@@ -62,7 +63,9 @@ def main() -> int:
     options = parser.parse_args()
     try:
         if options.what == "tags":
-            tag_map = TagMap.from_yaml(options.tag_map, options.family)
+            tag_map = TagMap.from_yaml(options.tag_map)
+            if options.family is not None:
+                tag_map = dataclasses.replace(tag_map, family=FAMILIES[options.family])
             _write(tag_pages(tag_map, options.paper), "tags", options)
         else:
             _write([board_page(given_board(options), options.paper)], "board", options)
