@@ -12,7 +12,6 @@ from waiting import Clock
 
 from der_planner.page.access import (
     KEPT,
-    MOST_WINDOWS,
     AccessError,
     AccessFilter,
     Binding,
@@ -152,14 +151,3 @@ def test_the_desk_is_kept_for_a_while() -> None:
     assert desk.take("b")
     desk.hear("again", "tab 1")
     assert desk.operator == "b"
-
-
-def test_the_desk_knows_a_bounded_number_of_windows() -> None:
-    desk = Desk()
-    desk.hear("operator", "tab")
-    desk.take("operator")
-    for number in range(3 * MOST_WINDOWS):
-        desk.hear(f"window {number}", "another tab")
-    assert len(desk._tabs) == MOST_WINDOWS
-    desk.hear("loaded anew", "tab")
-    assert desk.may_command("loaded anew")

@@ -31,7 +31,6 @@ DIAGNOSTICS_TYPE = "diagnostic_msgs/msg/DiagnosticArray"
 TRUTH_SUFFIX = "twin/ground_truth"
 BOARD_SUFFIX = "twin/board_commands"
 FAULT_MODE = 5
-MOST_FAULTS = 1000
 _SAME = 1e-6
 """Pressures that differ by less are the same number, written twice [Pa]."""
 _LOOK_BACK = 40
@@ -191,8 +190,7 @@ class LimbRecord:
         self.commanded.append(stamp, message.commanded_differential)
         self.measured.append(stamp, message.measured_differential)
         if message.mode == FAULT_MODE:
-            new = [(stamp, reason) for reason in message.faults or ["fault"]]
-            self.faults += [entry for entry in new if len(self.faults) < MOST_FAULTS]
+            self.faults += [(stamp, reason) for reason in message.faults or ["fault"]]
 
     def add_board(self, message: Any) -> None:
         """Add the `ChamberPressures` of a command that the twin's board received."""

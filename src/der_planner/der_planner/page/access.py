@@ -23,8 +23,6 @@ LOOPBACK_NAMES = ("127.0.0.1", "localhost", "::1")
 SAFE_METHODS = ("GET", "HEAD")
 KEPT = 15.0
 """The desk is kept for an operator whose browser is silent for this time [s]."""
-MOST_WINDOWS = 100
-"""Windows whose tabs are known."""
 HEADERS = (
     (b"x-frame-options", b"DENY"),
     (b"x-content-type-options", b"nosniff"),
@@ -237,7 +235,7 @@ class Desk:
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
-        self._tabs: dict[str, str] = {}  # of each window, in the order in which they were loaded
+        self._tabs: dict[str, str] = {}  # of each window
         self._holder = ""
         self._heard = -math.inf
 
@@ -267,8 +265,6 @@ class Desk:
             if self.operator is not None and self._tabs.get(self._holder) == tab:
                 self._holder = window
             self._tabs[window] = tab
-            if len(self._tabs) > MOST_WINDOWS:
-                del self._tabs[next(name for name in self._tabs if name != self._holder)]
         if window == self._holder:
             self._heard = self._clock()
 

@@ -47,8 +47,6 @@ SILENT = "silent"
 """In place of the mode of a driver that is not heard any more."""
 FORGOTTEN = 60.0
 """A node that is none of this limb's is forgotten after this time [s] without diagnostics."""
-MOST_NODES = 30
-"""Nodes that are known at once."""
 FATAL = 50
 """Level of a node's last words in the log."""
 LEVELS = ("ok", "warning", "error", "stale")
@@ -170,9 +168,6 @@ class Situation:
         process = values.get("process", "")
         with self._lock:
             self._forget_nodes()
-            known = node["own"] or status.name in self._nodes
-            if not known and len(self._nodes) >= MOST_NODES:
-                return
             self._nodes[status.name] = node, self._clock()
             if process != self._processes.get(status.name, _UNKNOWN)[0]:
                 self._processes[status.name] = (process, *_process(process))
