@@ -8,7 +8,7 @@ import pytest
 from apriltag_tracker.camera import pinhole
 from apriltag_tracker.detection import Detector, edges
 from apriltag_tracker.pipeline import LimbTracker, TrackerOptions, warm_up
-from apriltag_tracker.pose.following import Uncertainty
+from apriltag_tracker.pose.shape import Uncertainty
 from apriltag_tracker.synthetic.camera import Errors, Optics, SyntheticCamera
 
 pytestmark = pytest.mark.slow

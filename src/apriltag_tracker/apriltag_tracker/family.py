@@ -87,8 +87,7 @@ class Family:
     def code_mask(self) -> NDArray[np.bool_]:
         """Tell which cells of a tag with its rim belong to the code, (n, n)."""
         rings = self.rings()
-        mask: NDArray[np.bool_] = (rings >= 1) | (rings <= -2)
-        return mask
+        return np.asarray((rings >= 1) | (rings <= -2))
 
     def codes(self) -> NDArray[np.uint8]:
         """Return the white (1) and black (0) code cells of all printed tags, (tags, cells).

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from apriltag_tracker.camera import CameraPose, Intrinsics
 from apriltag_tracker.detection import Detector, Tag
 from apriltag_tracker.detection.tracking import FULL_SEARCH_PERIOD, TagTracker
-from apriltag_tracker.pose.following import FollowerOptions, LimbFollower, survey_errors
-from apriltag_tracker.pose.shape import LimbEstimate, PlanarTag, centreline_pose
+from apriltag_tracker.pose.following import LimbFollower, survey_errors
+from apriltag_tracker.pose.shape import FollowerOptions, LimbEstimate, PlanarTag, centreline_pose
 from apriltag_tracker.pose.world import WorldPose, locate
 from apriltag_tracker.tag_map import LimbTag, TagMap, WorldTag
 

@@ -15,7 +15,7 @@ from apriltag_tracker.bodies.tracker import (
     PlaneWatch,
     fit_frame,
 )
-from apriltag_tracker.pose.following import FollowerOptions, Uncertainty
+from apriltag_tracker.pose.shape import FollowerOptions, Uncertainty
 from apriltag_tracker.synthetic.poses import MocapFaults, SyntheticMocap
 from apriltag_tracker.tag_map import MapError
 

@@ -7,6 +7,7 @@ import pytest
 
 from apriltag_tracker.pose.curve import Curve, Evaluation
 from apriltag_tracker.pose.shape import (
+    FollowerOptions,
     PlanarTag,
     ShapeFitter,
     ShapePrior,
@@ -93,7 +94,7 @@ def test_without_the_last_tags_the_tip_is_left_open(plain):
 
 def test_errors_shared_by_all_tags_move_the_tip(plain):
     shape = constant_curvature(plain.segment_lengths, [0.4, 0.3])
-    fitter = ShapeFitter(plain, ShapePrior(base_position=1.0, base_heading=1.0))
+    fitter = ShapeFitter(plain, FollowerOptions(prior=ShapePrior(1.0, 1.0)))
     common = np.zeros((5, 3, 1))
     common[:, 0, 0] = 1e-3
     alone = fitter.fit(seen(plain, shape))

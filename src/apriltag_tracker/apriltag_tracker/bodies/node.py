@@ -12,8 +12,8 @@ from geometry_msgs.msg import Pose2D
 from apriltag_tracker.bodies.body_map import BodyMap
 from apriltag_tracker.bodies.forms import FORMS, PoseFormError, message_type, poses_of, topics_of
 from apriltag_tracker.bodies.tracker import BodyNoise, BodyTracker, FrameAssembler, PoseFrame
-from apriltag_tracker.pose.following import FollowerOptions
 from apriltag_tracker.pose.node import LimbStateNode
+from apriltag_tracker.pose.shape import FollowerOptions
 from apriltag_tracker.watching import StreamWatch
 from der_msgs.msg import TagDetection
 from limb_interfaces import qos, stamps

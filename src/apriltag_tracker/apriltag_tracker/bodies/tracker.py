@@ -16,13 +16,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from apriltag_tracker.bodies.body_map import BaseFrame, BodyMap
-from apriltag_tracker.pose.following import (
-    Followed,
-    FollowerOptions,
-    LimbFollower,
-    survey_errors,
-)
-from apriltag_tracker.pose.shape import PlanarTag, centreline_pose
+from apriltag_tracker.pose.following import Followed, LimbFollower, survey_errors
+from apriltag_tracker.pose.shape import FollowerOptions, PlanarTag, centreline_pose
 
 Array = NDArray[np.float64]
 

@@ -179,8 +179,7 @@ class Intrinsics:
     def rays(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return normalised coordinates (n, 2) of pixels (n, 2), lens distortion removed."""
         points = np.ascontiguousarray(pixels, dtype=np.float64).reshape(-1, 2)
-        result: NDArray[np.float64] = undistort_pixels(points, self.matrix, self.distortion)
-        return result
+        return np.asarray(undistort_pixels(points, self.matrix, self.distortion))
 
     def pixels(self, normalised: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return pixels (n, 2) of normalised coordinates (n, 2), lens distortion added."""
@@ -218,22 +217,19 @@ class CameraPose:
     @property
     def position(self) -> NDArray[np.float64]:
         """Where the camera is in `limb_base`, (3,) m."""
-        result: NDArray[np.float64] = -self.rotation.T @ self.translation
-        return result
+        return np.asarray(-self.rotation.T @ self.translation)
 
     def normalised(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return normalised image coordinates (n, 2) of points (n, 3) in `limb_base`."""
         inside = points @ self.rotation.T + self.translation
-        result: NDArray[np.float64] = inside[:, :2] / inside[:, 2:3]
-        return result
+        return np.asarray(inside[:, :2] / inside[:, 2:3])
 
     def onto_plane(self, rays: NDArray[np.float64], height: float) -> NDArray[np.float64]:
         """Return where rays (n, 2) meet the plane at a height [m] over the base, (n, 2) m."""
         directions = rays @ self.rotation[:2] + self.rotation[2]
         origin = self.position
         scale = (height - origin[2]) / directions[:, 2]
-        result: NDArray[np.float64] = origin[:2] + scale[:, None] * directions[:, :2]
-        return result
+        return np.asarray(origin[:2] + scale[:, None] * directions[:, :2])
 
 
 def project(

@@ -71,8 +71,7 @@ class Tag:
         along, across, gap = c - a, d - b, b - a
         determinant = along[0] * across[1] - along[1] * across[0]
         share = (gap[0] * across[1] - gap[1] * across[0]) / determinant
-        result: NDArray[np.float64] = a + share * along
-        return result
+        return np.asarray(a + share * along)
 
     @property
     def pixel_size(self) -> float:

@@ -76,8 +76,7 @@ class Track:
 
     def _bent(self, gap: float) -> NDArray[np.float64]:
         """Return by how much the parabola leaves the straight line after a time [s], (4, 2) px."""
-        bent: NDArray[np.float64] = self.acceleration * (0.5 * gap * (gap + self.step))
-        return bent
+        return np.asarray(self.acceleration * (0.5 * gap * (gap + self.step)))
 
     def follow(self, tag: Tag, stamp: float) -> Track:
         """Return the track with one more picture of the tag."""

@@ -9,10 +9,19 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from apriltag_tracker.bodies.body_map import BodyMap
-from apriltag_tracker.pose.shape import PlanarTag, ShapeFitter, ShapePrior, centreline_pose
+from apriltag_tracker.pose.shape import (
+    FollowerOptions,
+    PlanarTag,
+    ShapeFitter,
+    ShapePrior,
+    centreline_pose,
+)
 from apriltag_tracker.tag_map import TagMap
 
-_FREE = ShapePrior(base_position=0.05, base_heading=0.5, corrections=(2.0,))
+_FREE = FollowerOptions(
+    reject_beyond=1.0,
+    prior=ShapePrior(base_position=0.05, base_heading=0.5, corrections=(2.0,)),
+)
 """The clamp may be anywhere near; the limb bends nearly as arcs."""
 _NOISE = np.diag([1e-4, 1e-4, 3e-3]) ** 2
 _MOST = 60
@@ -41,7 +50,7 @@ def find_clamp(bodies: TagMap | BodyMap, places: NDArray[np.float64]) -> Clamp |
     Returns:
         The clamp; None if fewer than three frames show three of them.
     """
-    fitter = ShapeFitter(bodies, _FREE, reject_beyond=1.0)
+    fitter = ShapeFitter(bodies, _FREE)
     seen = np.asarray(np.isfinite(places).all(axis=2))
     frames = np.flatnonzero(seen.sum(axis=1) >= 3)
     found = []

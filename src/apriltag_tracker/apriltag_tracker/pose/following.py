@@ -6,56 +6,14 @@ The pictures' bodies may be tags of a camera or rigid bodies of a motion capture
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apriltag_tracker.pose.shape import (
-    LimbEstimate,
-    PlanarTag,
-    ShapeFitter,
-    ShapePrior,
-)
+from apriltag_tracker.pose.shape import FollowerOptions, LimbEstimate, PlanarTag, ShapeFitter
 from apriltag_tracker.tag_map import LimbGeometry
-
-
-@dataclass(frozen=True)
-class Uncertainty:
-    """Standard deviations of what averaging does not remove.
-
-    Attributes:
-        survey: of the positions of fixed tags or bodies [m].
-        height: of the limb tags' heights [m].
-        mounting: of the positions of tags or bodies on the limb [m].
-        mounting_angle: of their directions [rad].
-    """
-
-    survey: float = 3e-4
-    height: float = 5e-4
-    mounting: float = 2e-4
-    mounting_angle: float = 5e-3
-
-
-@dataclass(frozen=True)
-class FollowerOptions:
-    """How the limb is followed.
-
-    Attributes:
-        bridge_frames: frames without a tip that are bridged from the motion before.
-        reject_beyond: distance from the others' shape at which one is on the wrong place [m].
-        largest_tip_sigma: standard deviation of the tip, noise and systematic together, above which
-            it is not told [m].
-        uncertainty: what averaging does not remove.
-        prior: how the limb may differ from ideal.
-    """
-
-    bridge_frames: int = 5
-    reject_beyond: float = 0.004
-    largest_tip_sigma: float = 0.01
-    uncertainty: Uncertainty = field(default_factory=Uncertainty)
-    prior: ShapePrior = field(default_factory=ShapePrior)
 
 
 class Followed(NamedTuple):
@@ -116,14 +74,7 @@ class LimbFollower:
         self._names = geometry.limb_names
         self._options = options
         self._noun, self._place = noun, place
-        uncertainty = options.uncertainty
-        self._fitter = ShapeFitter(
-            geometry,
-            options.prior,
-            options.reject_beyond,
-            uncertainty.mounting,
-            uncertainty.mounting_angle,
-        )
+        self._fitter = ShapeFitter(geometry, options)
         self._history: list[tuple[float, LimbEstimate]] = []
         self._bridged = 0
         self.misplaced = 0

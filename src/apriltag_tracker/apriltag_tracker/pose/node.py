@@ -23,8 +23,7 @@ from rclpy.qos import QoSProfile
 from scipy.spatial.transform import Rotation
 from visualization_msgs.msg import Marker, MarkerArray
 
-from apriltag_tracker.pose.following import FollowerOptions
-from apriltag_tracker.pose.shape import LimbEstimate
+from apriltag_tracker.pose.shape import FollowerOptions, LimbEstimate
 from der_msgs.msg import LimbState, TagDetection, TagDetectionArray
 from limb_interfaces import qos, stamps, topics
 from limb_interfaces.parameters import declare

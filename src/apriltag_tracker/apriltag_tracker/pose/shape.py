@@ -65,6 +65,43 @@ class ShapePrior:
 
 
 @dataclass(frozen=True)
+class Uncertainty:
+    """Standard deviations of what averaging does not remove.
+
+    Attributes:
+        survey: of the positions of fixed tags or bodies [m].
+        height: of the limb tags' heights [m].
+        mounting: of the positions of tags or bodies on the limb [m].
+        mounting_angle: of their directions [rad].
+    """
+
+    survey: float = 3e-4
+    height: float = 5e-4
+    mounting: float = 2e-4
+    mounting_angle: float = 5e-3
+
+
+@dataclass(frozen=True)
+class FollowerOptions:
+    """How the limb is followed.
+
+    Attributes:
+        bridge_frames: frames without a tip that are bridged from the motion before.
+        reject_beyond: distance from the others' shape at which one is on the wrong place [m].
+        largest_tip_sigma: standard deviation of the tip, noise and systematic together, above which
+            it is not told [m].
+        uncertainty: what averaging does not remove.
+        prior: how the limb may differ from ideal.
+    """
+
+    bridge_frames: int = 5
+    reject_beyond: float = 0.004
+    largest_tip_sigma: float = 0.01
+    uncertainty: Uncertainty = field(default_factory=Uncertainty)
+    prior: ShapePrior = field(default_factory=ShapePrior)
+
+
+@dataclass(frozen=True)
 class LimbEstimate:
     """The limb in one image.
 
@@ -128,8 +165,7 @@ def centreline_pose(
 def _carried(gain: NDArray[np.float64], spreads: NDArray[np.float64]) -> NDArray[np.float64]:
     """Carry independent covariances (n, 3, 3), or one for all (3, 3), through a gain (m, n, 3)."""
     by_tag = gain.transpose(1, 0, 2)
-    result: NDArray[np.float64] = (by_tag @ spreads @ by_tag.transpose(0, 2, 1)).sum(axis=0)
-    return result
+    return np.asarray((by_tag @ spreads @ by_tag.transpose(0, 2, 1)).sum(axis=0))
 
 
 def _furthest(fit: CurveFit) -> float:
@@ -148,24 +184,16 @@ class ShapeFitter:
 
     Args:
         geometry: of the limb.
-        prior: how the limb may differ from ideal.
-        reject_beyond: distance from the fit of all others at which a tag is on the wrong place [m].
-        mounting: standard deviation of the tags' mounting on the limb [m].
-        mounting_angle: the same of their direction [rad].
+        options: how it works.
     """
 
-    def __init__(
-        self,
-        geometry: LimbGeometry,
-        prior: ShapePrior | None = None,
-        reject_beyond: float = 0.004,
-        mounting: float = 2e-4,
-        mounting_angle: float = 5e-3,
-    ) -> None:
-        self.prior = prior or ShapePrior()
-        self.reject_beyond = reject_beyond
-        self._mounting = np.array([mounting, mounting, mounting_angle])
-        self._smooth = Curve(geometry.segment_lengths, len(self.prior.corrections), geometry.stiff)
+    def __init__(self, geometry: LimbGeometry, options: FollowerOptions | None = None) -> None:
+        options = options or FollowerOptions()
+        self._prior = options.prior
+        self._reject_beyond = options.reject_beyond
+        mounting, angle = options.uncertainty.mounting, options.uncertainty.mounting_angle
+        self._mounted = np.diag([mounting, mounting, angle]) ** 2
+        self._smooth = Curve(geometry.segment_lengths, len(self._prior.corrections), geometry.stiff)
         self._constant = Curve(geometry.segment_lengths, 0, geometry.stiff)
         self._outline = Evaluation(
             self._smooth, np.linspace(0.0, geometry.length, CURVE_POINTS).tolist()
@@ -219,14 +247,14 @@ class ShapeFitter:
         while kept:
             arcs = self._solve(self._constant, kept, self._last)
             furthest = _furthest(arcs)
-            if furthest < 0.5 * self.reject_beyond or len(kept) < 3:
+            if furthest < 0.5 * self._reject_beyond or len(kept) < 3:
                 break
             outside, distance, rest = self._odd_one_out(kept)
-            if distance < self.reject_beyond or rest > 0.5 * furthest:
+            if distance < self._reject_beyond or rest > 0.5 * furthest:
                 break
             rejected[kept[outside].id] = distance
             del kept[outside]
-        if len(kept) <= len(tags) // 2 or furthest > _HOPELESS * self.reject_beyond:
+        if len(kept) <= len(tags) // 2 or furthest > _HOPELESS * self._reject_beyond:
             return kept, rejected, None
         return kept, rejected, arcs
 
@@ -250,7 +278,7 @@ class ShapeFitter:
         return outside, float(np.hypot(*(place[0, :2] - tag.pose[:2]))), rest[outside]
 
     def _prior_sigma(self, curve: Curve) -> NDArray[np.float64]:
-        prior = self.prior
+        prior = self._prior
         base = [prior.base_position, prior.base_position, prior.base_heading, prior.elongation]
         mean = [prior.curvature] * curve.segments
         return np.array(base + mean + list(prior.corrections[: curve.degrees]) * curve.segments)
@@ -263,7 +291,7 @@ class ShapeFitter:
     ) -> CurveFit:
         """Find the most probable parameters and the gain (size, n, 3) from measurements to them."""
         evaluation = self._evaluation(curve, tuple(tag.arc_length for tag in tags))
-        prior = self.prior
+        prior = self._prior
         position, heading = prior.arc_position, prior.arc_heading
         if curve.degrees:
             position, heading = prior.tag_position, prior.tag_heading
@@ -287,10 +315,9 @@ class ShapeFitter:
     ) -> LimbEstimate:
         curve, slopes = self._outline.places(fit.parameters)
         spreads = np.array([tag.covariance for tag in tags])
-        mounted = np.diag(self._mounting**2)
         tip_gain = np.tensordot(slopes[-1, :2], fit.gain, 1)
         noise = _carried(tip_gain, spreads)
-        systematic = _carried(tip_gain, mounted)
+        systematic = _carried(tip_gain, self._mounted)
         shared = np.tensordot(tip_gain, common, 2)
         systematic += shared @ shared.T
         shared = np.tensordot(tip_gain, shared_noise, 2)
@@ -304,7 +331,7 @@ class ShapeFitter:
         means = slice(4, 4 + self._smooth.segments)
         bending = self._smooth.active
         bend_gain = fit.gain[means]
-        variance = np.diag(_carried(bend_gain, spreads + mounted))
+        variance = np.diag(_carried(bend_gain, spreads + self._mounted))
         variance = variance + np.sum(fit.left_open[means] ** 2, axis=1)
         return LimbEstimate(
             tip=curve[-1, :2],

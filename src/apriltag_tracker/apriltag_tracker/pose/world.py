@@ -164,8 +164,7 @@ class WorldPose:
         # Of a point in the camera's frame, the first six are by a turn and a shift there.
         parts = np.linalg.pinv(slopes[:, :6]).reshape(6, -1, 8).swapaxes(0, 1)
         spreads = np.array([self._seen[tag].noise for tag in ids]) + LASTING_ERROR**2 * np.eye(8)
-        result: NDArray[np.float64] = (parts @ spreads @ parts.swapaxes(1, 2)).sum(axis=0)
-        return result
+        return np.asarray((parts @ spreads @ parts.swapaxes(1, 2)).sum(axis=0))
 
     def _best_without(self, ids: Sequence[int]) -> int:
         """Return the place among some fixed tags of the one without which the others agree best."""
