@@ -14,7 +14,6 @@ connectors, and at the masses that the limb carries, which are not damped.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -82,6 +81,7 @@ class ArcModel(Model):
     """
 
     name = "pcc"
+    rest: ArcState
 
     def __init__(self, limb: Limb, nodes: int = NODES) -> None:
         super().__init__(limb, nodes)
@@ -198,14 +198,9 @@ class ArcModel(Model):
         torque: Array = self.stiffness * bend + self.cubic * bend**3
         return torque
 
-    @cached_property
-    def rest(self) -> ArcState:
-        """The vented arcs at rest."""
-        return self.resting(np.zeros(self.inputs))
-
     def state(self, angles: ArrayLike, rates: ArrayLike) -> ArcState:
         """Return the arcs at bend angles and rates (M,) [rad], [rad/s]."""
-        return ArcState(np.asarray(angles, dtype=float), np.asarray(rates, dtype=float))
+        return ArcState(self._check("angles", angles), self._check("rates", rates))
 
     def resting(self, effective: Array) -> ArcState:
         """Return the arcs at rest under effective pressures (M,) [Pa] and their weight."""
@@ -283,9 +278,8 @@ class ArcModel(Model):
         inputs = np.ascontiguousarray(effective, dtype=float)
         if inputs.ndim != 3 or inputs.shape[2] != self.segment_count:
             raise ValueError(f"pressures must be (K, S, {self.segment_count}), got {inputs.shape}")
-        q, v = self._check("angles", start.angles), self._check("rates", start.rates)
         step, linear = period / inputs.shape[1], None
-        given = (q, v, inputs, step, self._parts(step), self.arcs)
+        given = (start.angles, start.rates, inputs, step, self._parts(step), self.arcs)
         if linearise:
             angles, rates, by_state, by_pressure = kernels.linearised(*given)
             linear = ArcFirstOrder(self.tip_jacobians(angles), by_state, by_pressure)

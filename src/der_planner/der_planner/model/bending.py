@@ -67,19 +67,14 @@ def bend_change(rod: Rod, q: Array, moved: Array) -> Array:
         q: (K, 4N-1).
         moved: (K, 4M) change of the coordinates `bend_outputs`, or (K, 4M, C) changes.
     """
-    columns = []
-    for place, (a, b) in enumerate(end_edges(rod)):
-        x1, y1, x2, y2 = np.moveaxis(moved[:, 4 * place : 4 * place + 4], 1, 0)
-        dx, dy, square = (part.reshape(-1, *np.ones_like(x1.shape[1:])) for part in _edge(q, a, b))
-        columns.append((dx * (y2 - y1) - dy * (x2 - x1)) / square)
-    relative: Array = np.diff(np.stack(columns, axis=1), axis=1, prepend=0.0)
+    ends, ends_moved = (
+        part.reshape(len(q), -1, 2, 2, *part.shape[2:]) for part in (q[:, bend_outputs(rod)], moved)
+    )
+    edge, change = (part[:, :, 1] - part[:, :, 0] for part in (ends, ends_moved))
+    across = np.stack([-edge[..., 1], edge[..., 0]], axis=-1)
+    turned = np.einsum("kma,kma...->km...", across / (edge**2).sum(-1, keepdims=True), change)
+    relative: Array = np.diff(turned, axis=1, prepend=0.0)
     return relative
-
-
-def _edge(q: Array, first: int, second: int) -> tuple[Array, Array, Array]:
-    dx = q[:, 4 * second] - q[:, 4 * first]
-    dy = q[:, 4 * second + 1] - q[:, 4 * first + 1]
-    return dx, dy, dx * dx + dy * dy
 
 
 class TipOfBend(Protocol):

@@ -19,7 +19,6 @@ about it is small and fast and hardly changes them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
@@ -37,23 +36,14 @@ _SAME_PRESSURE = 1e-6
 """[Pa] change below which the neighbours' pressures are known."""
 
 
-@dataclass(frozen=True)
-class Memory:
-    """What friction and creep remember at one instant.
+class Memory(NamedTuple):
+    """What friction and creep remember at one instant, (M,) each, or at K instants, (K, M) each.
 
     Attributes:
-        bend: (M,) bend angle at that instant [rad].
-        friction: (M,) z of each Dahl element, −1 … 1.
-        creep: (M,) q, strain of each Maxwell element's spring [1/m].
+        bend: bend angle [rad].
+        friction: z of each Dahl element, −1 … 1.
+        creep: q, strain of each Maxwell element's spring [1/m].
     """
-
-    bend: Array
-    friction: Array
-    creep: Array
-
-
-class MemoryHistory(NamedTuple):
-    """Bend angle [rad], friction's z and creep's strain q [1/m] of K instants, each (K, M)."""
 
     bend: Array
     friction: Array
@@ -61,7 +51,7 @@ class MemoryHistory(NamedTuple):
 
     def at(self, index: int) -> Memory:
         """Return what is remembered at one of the instants, to go on from there."""
-        return Memory(self.bend[index], self.friction[index], self.creep[index])
+        return Memory(*(part[index] for part in self))
 
 
 class Material:
@@ -84,9 +74,7 @@ class Material:
 
     # Along a known bend ------------------------------------------------------------------------
 
-    def differential_pressure(
-        self, time: ArrayLike, effective: ArrayLike, bend_angle: ArrayLike
-    ) -> Array:
+    def differential_pressure(self, time: Array, effective: Array, bend_angle: Array) -> Array:
         """Return the differential pressures (K, M) [Pa] that make a limb feel effective ones.
 
         Args:
@@ -95,33 +83,24 @@ class Material:
             bend_angle: (K, M) bend along the motion [rad].
 
         Raises:
-            ValueError: shapes do not fit, or the stiffening makes a pressure unreachable.
+            ValueError: the stiffening makes a pressure unreachable.
         """
-        times, wanted, angles = (
-            np.asarray(each, dtype=float) for each in (time, effective, bend_angle)
-        )
-        expected = (times.size, self._count)
-        if times.ndim != 1 or wanted.shape != expected or angles.shape != expected:
-            raise ValueError(
-                f"expected time (K,), pressures and bend angles (K, {self._count}); got "
-                f"{times.shape}, {wanted.shape}, {angles.shape}"
-            )
-        driven = wanted + self.memory_pressures(times, angles)
-        result = np.zeros_like(wanted)
+        driven = effective + self.memory_pressures(time, bend_angle)
+        result = np.zeros_like(effective)
         # The neighbours' pressures are known but for what their neighbours change: a contraction.
-        for _ in range(_COUPLING_ROUNDS if self._coupling.any() else 1):
-            before = result.copy()
+        for _ in range(_COUPLING_ROUNDS):
+            before = result
             load = driven - before @ self._coupling.T
             # w (1 + s |u|) = u (1 + a sgn u) − load + w is linear on either side of zero.
             side = np.sign(load)
             slope = 1.0 + self._asymmetry * side
-            slope = slope - self._stiffening * wanted * side
+            slope -= self._stiffening * effective * side
             stiff = ~np.all(slope > 0.1, axis=0)
             if stiff.any():
                 index = int(np.argmax(stiff))
                 raise ValueError(
                     f"segment {index} is too stiff for an effective pressure of "
-                    f"{np.abs(wanted[:, index]).max():.0f} Pa: check its pressure_stiffening"
+                    f"{np.abs(effective[:, index]).max():.0f} Pa: check its pressure_stiffening"
                 )
             result = load / slope
             if np.abs(result - before).max(initial=0.0) < _SAME_PRESSURE:
@@ -161,9 +140,7 @@ class Material:
 
     # What friction and creep remember ----------------------------------------------------------
 
-    def remember(
-        self, time: Array, bend_angle: Array, start: Memory | None = None
-    ) -> MemoryHistory:
+    def remember(self, time: Array, bend_angle: Array, start: Memory | None = None) -> Memory:
         """Return z and q along bend histories (K, M) [rad]; arguments as of `memory_pressures`."""
         friction, creep = np.zeros_like(bend_angle), np.zeros_like(bend_angle)
         for index, segment in enumerate(self._segments):
@@ -173,9 +150,9 @@ class Material:
                 friction[:, index] = dahl(angle, segment.friction_curvature * segment.length, z)
             if segment.creep_stiffness > 0:
                 creep[:, index] = maxwell(time, angle / segment.length, segment.creep_time, q)
-        return MemoryHistory(bend_angle, friction, creep)
+        return Memory(bend_angle, friction, creep)
 
-    def pressure_taken(self, history: MemoryHistory) -> Array:
+    def pressure_taken(self, history: Memory) -> Array:
         """Return the (K, M) pressures that friction and creep take, by what they remember [Pa]."""
         columns = [
             (s.friction_moment * history.friction[:, i] + s.creep_stiffness * history.creep[:, i])
@@ -242,15 +219,16 @@ class Material:
             start: as of `resting_bend`.
         """
         bend = self.resting_bend(time, differential, start)
-        effective, _ = self.slow(time, differential, start)
+        taken = self.pressure_taken(self.remember(time, bend, start))
+        effective = self.without_memory(differential, taken)
         _, stiffer, gain, stiffening = self._drive(differential)
         moved = change * gain + change @ self._coupling.T - effective * change * stiffening
         law = self.resting_law
         pushed = (law.gain * moved / stiffer)[..., None]
-        _, taken = change_along(
+        _, taken_by = change_along(
             np.ascontiguousarray(time), stiffer, bend, law, self._begin(start), pushed
         )
-        result: Array = (moved - taken[..., 0]) / stiffer
+        result: Array = (moved - taken_by[..., 0]) / stiffer
         return result
 
     def driven_bend(self, time: Array, differential: Array, bend: Array) -> Array:

@@ -79,17 +79,13 @@ class RodModel(Model):
     """
 
     name = "der"
+    rest: RodState
     kinematics: PolylineKinematics
 
     def __init__(self, limb: Limb, nodes: int = NODES) -> None:
         super().__init__(limb, nodes)
         self.rod = Rod.from_limb(limb, nodes)
         self.kinematics = PolylineKinematics.of_rod(self.rod)
-
-    @cached_property
-    def rest(self) -> RodState:
-        """The vented rod at rest."""
-        return self.resting(np.zeros(self.inputs))
 
     @cached_property
     def balance(self) -> Balance:
