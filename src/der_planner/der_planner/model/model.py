@@ -10,7 +10,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar, Literal, Protocol, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,6 +21,9 @@ from der_planner.model.air import Air
 from der_planner.model.bending import Kinematics
 from der_planner.model.material import Material
 from der_planner.rod import RodState
+
+if TYPE_CHECKING:
+    from typing_extensions import Self  # `typing` has it from Python 3.11 on
 
 Outputs = Literal["", "tip", "all"]
 """What a linearisation keeps the derivatives of: nothing, the tip, or tip and bend angles."""

@@ -18,7 +18,7 @@ import copy
 import dataclasses
 import math
 from abc import ABC, abstractmethod
-from typing import Self
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.interpolate import BSpline, make_interp_spline
@@ -44,6 +44,9 @@ from der_planner.planning.workspace import (
     Workspace,
 )
 from der_planner.rod import ConvergenceError, Rod, RodState
+
+if TYPE_CHECKING:
+    from typing_extensions import Self  # `typing` has it from Python 3.11 on
 
 METHODS = {"der": ("paper", "projected", "optimal"), "pcc": ("paper", "projected", "optimal")}
 """The methods of each model. Arcs have one unknown a pressure: their two balances are the same."""
