@@ -71,9 +71,7 @@ class RestPressures:
         resolution: [Pa] of one step of the readings, which may flicker by as much.
     """
 
-    def __init__(
-        self, chamber_count: int, atmosphere: float = 0.0, resolution: float = 0.0
-    ) -> None:
+    def __init__(self, chamber_count: int, atmosphere: float, resolution: float) -> None:
         self.pressure = [atmosphere or math.nan] * chamber_count
         """(2M,) [Pa] absolute, what each sensor reads when vented; NaN until measured."""
         self.mean = fmean(self.pressure)

@@ -54,9 +54,7 @@ class BoardProtocol(ABC):
     """
 
     gauge: ClassVar[bool] = False
-    """Whether the wire carries pressures above the atmosphere."""
-    pairwise: ClassVar[bool] = False
-    """Whether the board reads a pair of pressures as a difference."""
+    """Whether the wire carries pressures above the atmosphere; else the differences of pairs."""
 
     def __init__(self, chamber_count: int, frames: FrameBuffer) -> None:
         self.chamber_count = chamber_count

@@ -247,13 +247,11 @@ class EmulatedBoard:
         room = self.pneumatics.atmosphere
         if self.protocol.gauge:
             self._target = room + np.maximum(pressure, 0.0)
-        elif self.protocol.pairwise:
+        else:
             low = np.minimum(pressure[0::2], pressure[1::2]).repeat(2)
             difference = pressure - low
             reading = self.atmosphere + difference
             self._target = np.where(difference > 0.0, reading - self._offset, room)
-        else:
-            self._target = pressure - self._offset
         self._vented = bool(np.all(self._target <= room))
         self._apply()
 

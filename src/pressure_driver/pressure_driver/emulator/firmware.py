@@ -35,8 +35,6 @@ _COMMAND = re.compile(r"[A-Z]{2,12}(?:;-?\d{1,6}(?:\.\d{1,6})?)*")
 class EzloopBoard(BoardProtocol):
     """The firmware's end of ``ezloop``."""
 
-    pairwise = True
-
     def __init__(self, chamber_count: int = 4) -> None:
         super().__init__(chamber_count, StreamCutter(b">", LONGEST_LIST))
 

@@ -234,6 +234,7 @@ class HostProtocol(ABC):
         self.unsettled = ""
         """Why no pressure may be commanded yet, though the board talks; empty if it may."""
         self._follow_up = b""
+        self._number = 0
 
     @property
     def rejected(self) -> int:
@@ -271,6 +272,11 @@ class HostProtocol(ABC):
         It is complete after any half-sent bytes.
         """
         return self.separator + self.vent()[0]
+
+    def _next(self) -> int:
+        """Return the number of the next frame, modulo 65536, for protocols that have numbers."""
+        self._number = (self._number + 1) & 0xFFFF
+        return self._number
 
     def follow_up(self) -> bytes:
         """Return what is to be sent at once because of what has been decoded."""

@@ -145,7 +145,6 @@ class FestoHost(HostProtocol):
     def __init__(self, chamber_count: int = 4) -> None:
         super().__init__(chamber_count, ModbusReader())
         self._motion_terminal = True
-        self._transaction = 0
         self.reset()
 
     def configure(self, settings: Settings) -> None:
@@ -182,7 +181,7 @@ class FestoHost(HostProtocol):
         """Encode one write of all setpoints to 1 mbar; its answer brings the question."""
         millibar = (round(value / PASCAL_PER_MILLIBAR) for value in gauge)
         values = [min(max(value, 0), LARGEST_SETPOINT) for value in millibar]
-        return self._write(values, self._acknowledging), self._transaction
+        return self._write(values, self._acknowledging), self._number
 
     def emergency(self) -> bytes:
         """Regulate to the room's pressure, also where slots are being acknowledged."""
@@ -192,10 +191,6 @@ class FestoHost(HostProtocol):
     def _places(self) -> int:
         """Slots, or valves of an MPA terminal."""
         return self.chamber_count // 2 if self._motion_terminal else self.chamber_count
-
-    def _next(self) -> int:
-        self._transaction = (self._transaction + 1) & 0xFFFF
-        return self._transaction
 
     def _write(self, values: Sequence[int], acknowledge: bool) -> bytes:
         """Encode one write of setpoints [mbar], in each slot behind its mode."""

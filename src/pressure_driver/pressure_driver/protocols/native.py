@@ -149,17 +149,12 @@ class NativeHost(HostProtocol):
 
     def __init__(self, chamber_count: int = 4) -> None:
         super().__init__(chamber_count, FrameSplitter())
-        self._sequence = 0
         self._board_time: int | None = None
         self._validity = VALIDITY
 
     def configure(self, settings: Settings) -> None:
         """Take over how long a command holds."""
         self._validity = round(1000.0 * settings.command_validity)
-
-    def _next(self) -> int:
-        self._sequence = (self._sequence + 1) & 0xFFFF
-        return self._sequence
 
     def start(self) -> bytes:
         """A zero byte, which ends whatever was half-sent, and HELLO."""
