@@ -39,13 +39,13 @@ def main() -> int:
     if len(sys.argv) != 2 or not re.fullmatch(r"\d+\.\d+\.\d+", sys.argv[1]):
         print("usage: set_version.py MAJOR.MINOR.PATCH, e.g. 0.2.0", file=sys.stderr)
         return 2
+    versions()  # all of them state one, or none is changed
+
+    def renewed(old: re.Match[str]) -> str:
+        return old[0].replace(old[1], sys.argv[1])
+
     for path, pattern in PLACES.items():
-        text = path.read_text()
-        match = re.search(pattern, text)
-        if match is None:
-            print(f"error: {path} states no version", file=sys.stderr)
-            return 1
-        path.write_text(text[: match.start(1)] + sys.argv[1] + text[match.end(1) :])
+        path.write_text(re.sub(pattern, renewed, path.read_text(), count=1))
     print("the newest entry of CHANGELOG.md must name it, too")
     return 0
 

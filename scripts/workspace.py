@@ -71,15 +71,20 @@ def ensure() -> None:
         run_jobs(*build_jobs(), *kernel_jobs())
 
 
+def _set_up() -> dict[str, str]:
+    """Set up what is missing and return the environment inside; end the process if it fails."""
+    try:
+        ensure()
+        return environment()
+    except SetupError as error:
+        sys.exit(f"error: {error}")
+
+
 def enter() -> None:
     """Make sure that the calling script runs inside the workspace; replaces the process if not."""
     if os.environ.get(INSIDE) == str(ROOT) and Path(sys.prefix) == VENV:
         return
-    try:
-        ensure()
-        inside = environment()
-    except SetupError as error:
-        sys.exit(f"error: {error}")
+    inside = _set_up()
     python = str(VENV / "bin" / "python")
     os.execve(python, [python, *sys.argv], inside)
 
@@ -106,16 +111,10 @@ def main() -> int:
     options = parser.parse_args()
     if options.action == "exec" and not options.command:
         parser.error("exec needs a command")
-    try:
-        ensure()
-        inside = environment()
-    except SetupError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    if options.action == "setup":
-        return 0
+    inside = _set_up()
     if options.action == "lock":
         write_lock()
+    if options.action in ("setup", "lock"):
         return 0
     command = options.command if options.action == "exec" else [os.environ.get("SHELL", "bash")]
     found = shutil.which(command[0], path=inside["PATH"])

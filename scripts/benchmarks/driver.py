@@ -39,12 +39,28 @@ PRESSES = 200
 """Of `vent` in the storm."""
 
 
-@dataclass
-class Heard:
-    """What the benchmark has heard while one case ran."""
+class Rig:
+    """Nodes that run until a stack ends, and what board and driver have said meanwhile.
 
-    commands: list[ChamberPressures] = field(default_factory=list)
-    states: list[PressureState] = field(default_factory=list)
+    Args:
+        stack: ends the nodes.
+        nodes: with the emulated board.
+        port: of the board.
+        folder: of their logs.
+    """
+
+    def __init__(
+        self, stack: contextlib.ExitStack, nodes: list[NodeSpec], port: str, folder: Path
+    ) -> None:
+        self.client = stack.enter_context(GraphClient("benchmark"))
+        self.commands: list[ChamberPressures] = []
+        self.states: list[PressureState] = []
+        subscribe = self.client.subscribe
+        subscribe(ChamberPressures, topics.TWIN_BOARD_COMMANDS, qos.SETPOINTS, self.commands.append)
+        subscribe(PressureState, topics.PRESSURE_STATE, qos.STATES, self.states.append)
+        self.graph = RunningGraph(self.client, Progress())
+        stack.callback(self.graph.stop)
+        self.graph.start(nodes, port, folder, {})
 
 
 Setpoints = dict[int, tuple[float, ...]]
@@ -99,9 +115,9 @@ def _passing_nodes() -> Iterator[None]:
             process.wait()
 
 
-def _press(graph: RunningGraph, seen: Heard, count: int) -> list[float]:
+def _press(rig: Rig, count: int) -> list[float]:
     """Press `vent` under a small command; return the times [s] until it is on the wire."""
-    client = graph.client
+    client = rig.client
     publisher = client.node.create_publisher(
         PressureSetpoint, topics.PRESSURE_SETPOINT, qos.SETPOINTS
     )
@@ -109,7 +125,7 @@ def _press(graph: RunningGraph, seen: Heard, count: int) -> list[float]:
     client.wait_for(vent.service_is_ready, 20.0, "the service")
 
     def pressed(since: int) -> float | None:
-        for command in seen.commands[since:]:
+        for command in rig.commands[since:]:
             if abs(command.pressure[0] - command.pressure[1]) < 1.0:
                 return nanoseconds(command.header.stamp) / 1e9
         return None
@@ -118,15 +134,15 @@ def _press(graph: RunningGraph, seen: Heard, count: int) -> list[float]:
         message = PressureSetpoint(plan_id=plan, differential_pressure=[300.0, 0.0])
         publisher.publish(message)
         client.spin(0.03)
-        newest = seen.commands[-1].pressure
+        newest = rig.commands[-1].pressure
         return bool(newest[0] - newest[1] > 200.0)
 
     times = []
     for press in range(count):
         plan = f"press {press}"
-        graph.arm(60.0)
+        rig.graph.arm(60.0)
         client.wait_for(commanded, 60.0, "the command on the wire")
-        since = len(seen.commands)
+        since = len(rig.commands)
         begin = time.time()
         vent.call_async(Trigger.Request())
         client.wait_for(lambda since=since: pressed(since), 20.0, "the vent on the wire")
@@ -196,10 +212,10 @@ class Samples:
     """1 if the run ended or was vented."""
 
 
-def _compare(wanted: Setpoints, seen: Heard) -> Samples:
+def _compare(wanted: Setpoints, rig: Rig) -> Samples:
     """Compare what was asked with what the board received, on the board's clock."""
     by_tick: dict[int, ChamberPressures] = {}
-    for command in seen.commands:
+    for command in rig.commands:
         by_tick.setdefault(nanoseconds(command.header.stamp) // PERIOD * PERIOD, command)
     latency = []
     for stamp, values in wanted.items():
@@ -209,7 +225,7 @@ def _compare(wanted: Setpoints, seen: Heard) -> Samples:
         pressure = np.array(command.pressure)
         if np.abs(pressure[0::2] - pressure[1::2] - values).max() < 1.5:
             latency.append((nanoseconds(command.header.stamp) - stamp) / 1e9)
-    return Samples(len(wanted), latency, seen.states[-1].setpoints_late)
+    return Samples(len(wanted), latency, rig.states[-1].setpoints_late)
 
 
 def _figures(case: str, played: list[Samples]) -> dict[str, float | str]:
@@ -247,34 +263,28 @@ def _measure(case: str, seconds: float, presses: int = 0) -> Samples:
     play: Callable[[GraphClient, float], Setpoints] = play_plan if case == "graph" else _stream
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="der_limb_driver_")))
-        client = stack.enter_context(GraphClient("benchmark"))
-        seen = Heard()
-        client.subscribe(
-            ChamberPressures, topics.TWIN_BOARD_COMMANDS, qos.SETPOINTS, seen.commands.append
-        )
-        client.subscribe(PressureState, topics.PRESSURE_STATE, qos.STATES, seen.states.append)
-        graph, port = RunningGraph(client, Progress()), str(folder / "board")
-        stack.callback(graph.stop)
-        graph.start(_nodes(case, port, folder), port, folder, {})
+        port = str(folder / "board")
+        rig = Rig(stack, _nodes(case, port, folder), port, folder)
+        client = rig.client
         client.call("pressure_driver/arm")
         busy = 0 if case in ("quiet", "graph") else os.cpu_count() or 1
         stack.enter_context(busy_loops(busy))
         if case == "storm":
             stack.enter_context(_passing_nodes())
         wanted = play(client, seconds)
-        samples = _compare(wanted, seen)
+        samples = _compare(wanted, rig)
         client.spin(1.1)
         told = client.diagnostic_values("pressure_driver")
         samples.ticks = {k: float(v) for k, v in told.items() if k.startswith("tick_to_")}
         samples.real_time_priority = told.get("real_time_priority", "unknown")
         bad = (PressureState.FAULT, PressureState.DISARMED)
-        lost = [s for s in seen.states if s.setpoints_accepted and s.mode in bad]
+        lost = [s for s in rig.states if s.setpoints_accepted and s.mode in bad]
         samples.lost = int(bool(lost))
         if lost:
             print(f"driver: vented: {'; '.join(lost[0].faults)}", file=sys.stderr)
         if case == "storm" and presses:
             client.call("pressure_driver/vent", 20.0)
-            samples.presses = _press(graph, seen, presses)
+            samples.presses = _press(rig, presses)
         return samples
 
 

@@ -16,11 +16,8 @@ import numpy as np
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
 
-from benchmarks.driver import busy_loops
+from benchmarks.driver import Rig, busy_loops
 from der_msgs.msg import ChamberPressures, MotionCommand, PressureSetpoint, PressureState
-from der_planner.experiment.client import GraphClient
-from der_planner.experiment.console import Progress
-from der_planner.experiment.graph_run import RunningGraph
 from der_planner.experiment.processes import PAGE_TOKEN, GraphError, GraphSetup
 from limb_interfaces import qos, topics
 from limb_interfaces.stamps import nanoseconds, stamp_from_nanoseconds
@@ -63,7 +60,19 @@ new MutationObserver(() => {
 """Notes when the window says what it is asked about [ms]."""
 
 
-class PageGraph:
+def open_browser(*flags: str) -> Any:
+    """Start the machine's Chromium, which is seen nowhere, with further flags."""
+    from selenium import webdriver  # noqa: PLC0415 - only tests and this need it
+
+    options = webdriver.ChromeOptions()
+    options.binary_location = shutil.which("chromium")
+    for flag in (*FLAGS, *flags):
+        options.add_argument(flag)
+    service = webdriver.ChromeService(shutil.which("chromedriver"))
+    return webdriver.Chrome(options=options, service=service)
+
+
+class PageGraph(Rig):
     """Board, driver, twin, camera, tracker, planner, recorder and the page, until it is closed.
 
     Args:
@@ -75,34 +84,19 @@ class PageGraph:
     def __init__(self, folder: Path, stack: contextlib.ExitStack, **options: Any) -> None:
         self._folder, self._stack = folder, stack
         self._windows = 0
-        self.client = stack.enter_context(GraphClient("benchmark"))
-        self.commands: list[ChamberPressures] = []
-        self.states: list[PressureState] = []
-        subscribe = self.client.subscribe
-        subscribe(ChamberPressures, topics.TWIN_BOARD_COMMANDS, qos.SETPOINTS, self.commands.append)
-        subscribe(PressureState, topics.PRESSURE_STATE, qos.STATES, self.states.append)
         board = str(folder / "board")
         options = {"metadata": {}, "planner": {}, **options}
         specs = GraphSetup(bag=folder / "bag", page=0, **options).nodes(board)
         for spec in specs:
             if spec.executable == "page":  # a window whose picture is taken is silent meanwhile
                 spec.parameters["lease_period"] = 10.0
-        self._graph = RunningGraph(self.client, Progress())
-        stack.callback(self._graph.stop)
-        self._graph.start(specs, board, folder, {})
+        super().__init__(stack, specs, board, folder)
         self.url = f"{self.client.diagnostic_values('page')['url']}?token={PAGE_TOKEN}"
 
     def open_window(self) -> Any:
         """Open the page in a browser of its own, and wait until it shows pictures."""
-        from selenium import webdriver  # noqa: PLC0415 - only tests and this need it
-
-        options = webdriver.ChromeOptions()
-        options.binary_location = shutil.which("chromium")
         self._windows += 1
-        for flag in (*FLAGS, f"--user-data-dir={self._folder / f'profile{self._windows}'}"):
-            options.add_argument(flag)
-        service = webdriver.ChromeService(shutil.which("chromedriver"))
-        window = webdriver.Chrome(options=options, service=service)
+        window = open_browser(f"--user-data-dir={self._folder / f'profile{self._windows}'}")
         self._stack.callback(window.quit)
         window.get(self.url)
         shown = "return !!page.data && page.pictures > 0"
@@ -120,15 +114,12 @@ class PageGraph:
 
     def arm(self) -> None:
         """Arm the driver as soon as it lets itself be armed: chambers take a while to vent."""
-        while self.states[-1].mode != PressureState.ARMED:
-            with contextlib.suppress(GraphError):
-                self.client.call("pressure_driver/arm", 20.0)
-            self.client.spin(0.2)
+        self.graph.arm(PATIENCE)
 
     def end(self, name: str, number: signal.Signals = signal.SIGKILL) -> None:
         """Kill or stop a node by a signal; from then on nobody expects any to live."""
         self.client.watch(())
-        self._graph.processes[name].signal(number)
+        self.graph.processes[name].signal(number)
 
     def break_board(self, faults: str) -> None:
         """Give the emulated board faults."""
@@ -138,7 +129,7 @@ class PageGraph:
 
     def measure_cpu(self, seconds: float) -> float:
         """Return the share of a core [%] that the page's process uses during some seconds."""
-        page, begin = self._graph.processes["page"], time.monotonic()
+        page, begin = self.graph.processes["page"], time.monotonic()
         before = page.measure_cpu()
         self.client.spin(seconds)
         return 100.0 * (page.measure_cpu() - before) / (time.monotonic() - begin)

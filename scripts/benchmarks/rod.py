@@ -37,11 +37,12 @@ class TimedRun:
         return self.seconds / self.simulated
 
 
-def cantilever(nodes: int, *, plane: str | None, clamp: str = "ghost") -> Rod:
-    """Return the cantilever of the design's check values."""
+def cantilever(nodes: int, *, plane: str | None, clamp: str = "ghost", stretch: float = 1.0) -> Rod:
+    """Return the cantilever of the design's check values, its EA times `stretch`."""
     return Rod.uniform(
-        length=LENGTH, nodes=nodes, EI=YOUNG * INERTIA, EA=YOUNG * AREA, GJ=SHEAR * 2 * INERTIA,
-        mass_per_length=DENSITY * AREA, clamp=clamp, gravity=(0, 0, GRAVITY), plane=plane,
+        length=LENGTH, nodes=nodes, EI=YOUNG * INERTIA, EA=stretch * YOUNG * AREA,
+        GJ=SHEAR * 2 * INERTIA, mass_per_length=DENSITY * AREA, clamp=clamp,
+        gravity=(0, 0, GRAVITY), plane=plane,
     )  # fmt: skip
 
 
@@ -101,11 +102,6 @@ def largest_stable_step(elements: int) -> float:
     raise RuntimeError(f"PyElastica with {elements} elements was stable at no step tried")
 
 
-def exponent(sizes: list[int], seconds: list[float]) -> float:
-    """Return the growth exponent of wall time with N, by least squares in the logarithms."""
-    return float(np.polyfit(np.log(sizes), np.log(seconds), 1)[0])
-
-
 def _scaling(figures: dict[str, float | str], sizes: list[int], repetitions: int) -> None:
     print("backward Euler, 5 ms, 1 s (first edge clamped inside, as in the design's check)")
     print("     N   planar us/step  us/iteration    3D us/step  us/iteration")
@@ -121,7 +117,9 @@ def _scaling(figures: dict[str, float | str], sizes: list[int], repetitions: int
             if nodes == 21:
                 figures[f"{key}_tip_z_mm"] = float(run.tip[2] * 1e3)
             seconds.append(run.seconds / run.iterations)
-        figures[f"{name}_growth_exponent"] = exponent(sizes, seconds)
+        # By least squares in the logarithms.
+        growth = np.polyfit(np.log(sizes), np.log(seconds), 1)[0]
+        figures[f"{name}_growth_exponent"] = float(growth)
     for nodes in sizes:
         row = [
             figures[f"{name}_n{nodes}_us_per_{unit}"]

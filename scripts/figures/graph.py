@@ -8,14 +8,12 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-import shutil
 import tempfile
 from pathlib import Path
 
 from workspace_setup.basics import ROOT
 
 DRAWING = ROOT / "docs" / "pictures" / "graph.svg"
-FLAGS = ("--headless", "--no-sandbox", "--disable-gpu", "--allow-file-access-from-files")
 LOOK = {"startOnLoad": False, "theme": "neutral", "htmlLabels": False}
 PAGE = """<body><script type="module">
 import {{ mermaid }} from "{module}";
@@ -39,18 +37,14 @@ def mark() -> str:
 def main() -> int:
     """Run the command line."""
     import nicegui  # noqa: PLC0415 - its wheel has Mermaid
-    from selenium import webdriver  # noqa: PLC0415
     from selenium.webdriver.support.ui import WebDriverWait  # noqa: PLC0415
 
+    from benchmarks.page import open_browser  # noqa: PLC0415 - it needs ROS
+
     dist = Path(nicegui.__file__).parent / "elements" / "mermaid" / "dist" / "index.js"
-    options = webdriver.ChromeOptions()
-    options.binary_location = shutil.which("chromium")
-    for flag in FLAGS:
-        options.add_argument(flag)
-    service = webdriver.ChromeService(shutil.which("chromedriver"))
     with (
         tempfile.NamedTemporaryFile("w", suffix=".html") as page,
-        webdriver.Chrome(options=options, service=service) as window,
+        open_browser("--allow-file-access-from-files") as window,
     ):
         words = {"look": json.dumps(LOOK), "text": json.dumps(text())}
         page.write(PAGE.format(module=dist.as_uri(), **words))

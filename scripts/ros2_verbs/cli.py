@@ -21,20 +21,6 @@ class EndedBySignal(BaseException):
     """SIGINT or SIGTERM has come; the argument is its number."""
 
 
-class Signals:
-    """Notes SIGINT and SIGTERM; the command ends where it next asks for them."""
-
-    def __init__(self) -> None:
-        self.received: list[int] = []
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, lambda number, _: self.received.append(number))
-
-    def check(self) -> None:
-        """Raise `EndedBySignal` if a signal has come."""
-        if self.received:
-            raise EndedBySignal(self.received[0])
-
-
 def _positive(text: str) -> float:
     value = float(text)
     if not value > 0.0:
@@ -162,7 +148,10 @@ def main(arguments: Sequence[str]) -> str | int | None:
     if isinstance(sys.stdout, io.TextIOWrapper):
         # A reader at the other end of a pipe sees each message when it comes.
         sys.stdout.reconfigure(line_buffering=True)
-    options.signals = Signals()
+    # The command ends where it next looks at them.
+    options.signals = []
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda number, _: options.signals.append(number))
     try:
         verbs = importlib.import_module("ros2_verbs.verbs")
         result: str | int | None = getattr(verbs, options.verb)(options)

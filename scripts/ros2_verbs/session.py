@@ -14,7 +14,7 @@ from rclpy.exceptions import InvalidTopicNameException
 from rclpy.qos import DurabilityPolicy, QoSPresetProfiles, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 
-from ros2_verbs.cli import CommandError
+from ros2_verbs.cli import CommandError, EndedBySignal
 from ros2_verbs.messages import interface
 
 AT_LEAST = 1.5
@@ -41,12 +41,13 @@ class Session:
     """A node for the time of one command; a context manager.
 
     Args:
-        options: of the command line; with ``signals``, and ``spin_time`` where the verb has it.
+        options: of the command line; with the ``signals`` that have come, and ``spin_time`` where
+            the verb has it.
     """
 
     def __init__(self, options: argparse.Namespace) -> None:
         self._spin_time: float | None = getattr(options, "spin_time", None)
-        self._signals = options.signals
+        self._signals: list[int] = options.signals
         rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
         self.node = rclpy.create_node(f"_ros2cli_{os.getpid()}", start_parameter_services=False)
 
@@ -61,7 +62,8 @@ class Session:
     def spin(self, seconds: float = 0.1) -> None:
         """Take what has come, for at most some time; raise `EndedBySignal` after a signal."""
         rclpy.spin_once(self.node, timeout_sec=seconds)
-        self._signals.check()
+        if self._signals:
+            raise EndedBySignal(self._signals[0])
 
     def wait(self, condition: Callable[[], Any], timeout: float = float("inf")) -> bool:
         """Spin until a condition holds, at most for a time [s]; tell whether it does."""

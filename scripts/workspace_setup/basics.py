@@ -152,8 +152,7 @@ def environment() -> dict[str, str]:
     result.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     result.setdefault("RCUTILS_COLORIZED_OUTPUT", "0")
     profile = ROOT / "src" / "apriltag_tracker" / "config" / "fastdds_large_images.xml"
-    if profile.exists():
-        result.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(profile))
+    result.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(profile))
     result[INSIDE] = str(ROOT)
     return result
 
