@@ -1,6 +1,7 @@
 """The Python half of the contract: parameters and their files, the transport of images."""
 
 import contextlib
+import sys
 
 import pytest
 import rclpy
@@ -53,14 +54,15 @@ def test_a_number_is_taken_where_a_text_or_a_float_is_wanted():
             declared(given, default, **options)
 
 
-def test_what_no_parameter_took_is_said_and_what_is_unknown_is_not_set(tmp_path):
+def test_what_no_parameter_took_is_said_and_what_is_unknown_is_not_set(tmp_path, monkeypatch):
     file = tmp_path / "of_another_limb.yaml"
     file.write_text("/lab7/declaring:\n  ros__parameters: {wanted: 31}\n")
     with node("-p", "wantde:=1", "--params-file", str(file)) as made:
         declare(made, "wanted", 3, "of a test", read_only=False)
         line = ["declaring", "--ros-args", "--params-file", str(file)]
+        monkeypatch.setattr(sys, "argv", line)
         with pytest.raises(ParameterError) as refused:
-            check_overrides(made, refuse=True, arguments=line)
+            check_overrides(made, refuse=True)
         said = str(refused.value)
         assert "'wantde' is set, but /declaring has none: did you mean 'wanted'?" in said
         assert "nothing under /lab7/declaring is for /declaring" in said

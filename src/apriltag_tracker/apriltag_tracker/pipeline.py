@@ -114,23 +114,19 @@ class LimbTracker:
             )
         found = self.tracker.track(gray, stamp, search_later)
         pose = self.world.update(found)
-        placed, planar, common, shared_noise = self._place(found, pose)
         if pose is None:
+            placed = tuple(PlacedTag(tag, tag.id in self._limb_tags, None) for tag in found)
             return LimbObservation(placed, None, f"no camera pose: {self.world.problem}")
-        followed = self.follower.follow(planar, stamp, common, shared_noise)
-        return LimbObservation(placed, *followed)
+        if not found:
+            return LimbObservation((), *self.follower.follow([], stamp))
+        return self._place(found, pose, stamp)
 
     def search_again(self, gray: NDArray[np.uint8]) -> None:
         """Look for duplicates and unknown tags in the last image, if that was left for later."""
         self.tracker.search_again(gray)
 
-    def _place(
-        self, found: Sequence[Tag], pose: CameraPose | None
-    ) -> tuple[tuple[PlacedTag, ...], list[PlanarTag], NDArray[np.float64], NDArray[np.float64]]:
-        """Place all tags on their planes; those of the limb also with shared errors and noise."""
-        if pose is None or not found:
-            placed = tuple(PlacedTag(tag, tag.id in self._limb_tags, None) for tag in found)
-            return placed, [], np.empty((0, 3, 0)), np.empty((0, 3, 0))
+    def _place(self, found: Sequence[Tag], pose: CameraPose, stamp: float) -> LimbObservation:
+        """Place all tags on their planes, and follow the limb by its own."""
         flat = np.array([self._flat[tag.id] for tag in found])
         places, spreads, misfits, moves = locate(
             np.array([tag.corners for tag in found]),
@@ -151,12 +147,13 @@ class LimbTracker:
             centre = centreline_pose(places[i], entry.offset)
             planar.append(PlanarTag(entry.id, entry.arc_length, centre, spreads[i]))
         common = self._common_errors(places[used], flat[used, 0], pose)
-        everywhere = tuple(
+        placed = tuple(
             PlacedTag(tag, tag.id in self._limb_tags, place)
             for tag, place in zip(found, places, strict=True)
         )
         root = np.linalg.cholesky(self.world.covariance + 1e-18 * np.eye(6))
-        return everywhere, planar, common, moves[used] @ root
+        followed = self.follower.follow(planar, stamp, common, moves[used] @ root)
+        return LimbObservation(placed, *followed)
 
     def _common_errors(
         self, places: NDArray[np.float64], heights: NDArray[np.float64], pose: CameraPose

@@ -6,7 +6,7 @@ import difflib
 import itertools
 import re
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -100,9 +100,7 @@ def _declared(node: Node, name: str, default: Value, descriptor: ParameterDescri
         return node.declare_parameter(name, meant, descriptor, ignore_override=True).value
 
 
-def check_overrides(
-    node: Node, refuse: bool = False, arguments: Sequence[str] | None = None
-) -> None:
+def check_overrides(node: Node, refuse: bool = False) -> None:
     """Warn of every parameter value that nothing took; call it when all parameters are declared.
 
     From then on a parameter that is set and not declared is refused by its name, too.
@@ -111,14 +109,13 @@ def check_overrides(
         node: the node.
         refuse: raise instead: for a node on which a limit that is silently left at its default
             could break the limb.
-        arguments: command line of the process, `sys.argv` if None.
 
     Raises:
         ParameterError: with ``refuse``, a value was taken by no parameter; names it and what it
             may have been meant to be.
     """
     node.add_pre_set_parameters_callback(lambda given: _only_declared(node, given))
-    found = [*_unknown_names(node), *_foreign_files(node, arguments)]
+    found = [*_unknown_names(node), *_foreign_files(node)]
     if found and refuse:
         raise ParameterError("; ".join(found))
     for text in found:
@@ -148,10 +145,12 @@ def _unknown_names(node: Node) -> Iterator[str]:
         yield f"parameter '{name}' is set, but {node.get_fully_qualified_name()} has none{meant}"
 
 
-def _foreign_files(node: Node, arguments: Sequence[str] | None) -> Iterator[str]:
+def _foreign_files(node: Node) -> Iterator[str]:
     """Yield a sentence for each parameter file that was meant for this node and misses it."""
     own = node.get_fully_qualified_name()
-    for path in parameter_files(sys.argv if arguments is None else arguments):
+    for word, path in itertools.pairwise(sys.argv):
+        if word != "--params-file":
+            continue
         try:
             content = yaml.safe_load(Path(path).read_text())
         except (OSError, yaml.YAMLError):
@@ -164,13 +163,6 @@ def _foreign_files(node: Node, arguments: Sequence[str] | None) -> Iterator[str]
                 f"parameter file {path}: nothing under {', '.join(same_name or strangers)} is for "
                 f"{own}; name it /**/{node.get_name()}, which fits every namespace"
             )
-
-
-def parameter_files(arguments: Sequence[str]) -> list[str]:
-    """Return the files that the command line gives as ``--params-file``."""
-    return [
-        following for word, following in itertools.pairwise(arguments) if word == "--params-file"
-    ]
 
 
 def node_keys(content: Any, above: str = "") -> Iterator[str]:

@@ -181,11 +181,9 @@ def _solve(
 
 
 def _coverage(views: Sequence[BoardView], width: int, height: int) -> float:
-    seen = np.zeros(_GRID, dtype=bool)
-    for view in views:
-        cells = (view.pixels / (width, height) * _GRID).astype(int)
-        seen[cells[:, 0].clip(0, _GRID[0] - 1), cells[:, 1].clip(0, _GRID[1] - 1)] = True
-    return float(seen.mean())
+    x, y = np.vstack([view.pixels for view in views]).T
+    seen, _, _ = np.histogram2d(x, y, _GRID, ((0, width), (0, height)))
+    return float(np.mean(seen > 0))
 
 
 @dataclass(frozen=True)

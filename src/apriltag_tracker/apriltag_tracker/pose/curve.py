@@ -36,18 +36,11 @@ class Curve:
         self.segments = len(lengths)
         self.degrees = degrees
         self.size = 4 + self.segments * (1 + degrees)
-        nodes, weights = np.polynomial.legendre.leggauss(4)
+        self._nodes, self._weights = np.polynomial.legendre.leggauss(4)
         self._stiff = tuple(stiff)
         self.active = np.diff(self._bending_length(ends))
-        edges = np.unique(
-            np.concatenate(
-                [np.linspace(a, b, _GRID + 1) for a, b in itertools.pairwise(ends)]
-                + [np.array(stretch) for stretch in self._stiff]
-            )
-        )
-        self._edges = edges
-        self._nodes = nodes
-        self._weights = weights
+        grids = [np.linspace(a, b, _GRID + 1) for a, b in itertools.pairwise(ends)]
+        self._edges = np.concatenate([*grids, *self._stiff])
 
     def _bending_length(self, s: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return how much of the limb up to each arc length can bend [m]."""

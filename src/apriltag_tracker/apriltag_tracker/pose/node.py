@@ -160,8 +160,7 @@ def limb_state(
         nan = math.nan
         message.tip = Point(x=nan, y=nan, z=nan)
         message.tip_covariance = message.tip_systematic = [nan] * 4
-        message.bend_angle = message.bend_angle_sigma = [nan] * segment_count
-        message.curvature = [nan] * segment_count
+        message.bend_angle = message.bend_angle_sigma = message.curvature = [nan] * segment_count
         message.elongation = message.residual = nan
         return message
     message.valid = True

@@ -88,7 +88,7 @@ class WorldPose:
         if self._moved(known):
             self.bumps += 1
             self._seen.clear()
-            self._frames = 0
+            self._frames = self._shifted = 0
         for tag in known:
             seen = self._seen.get(tag.id)
             if seen is None:
@@ -108,14 +108,9 @@ class WorldPose:
             return False
         gaps = np.array([tag.corners - self._seen[tag.id].corners for tag in averaged])
         shifts = sorted(np.hypot(*gaps.mean(axis=1).T).tolist())
-        if shifts[(len(shifts) - 1) // 2] > _BUMP:
-            self._shifted += 1
-        else:
-            self._shifted = 0
-        if self._shifted < _BUMP_FRAMES:
-            return False
-        self._shifted = 0
-        return True
+        typical = shifts[(len(shifts) - 1) // 2]
+        self._shifted = self._shifted + 1 if typical > _BUMP else 0
+        return self._shifted >= _BUMP_FRAMES
 
     def _solve(self) -> None:
         ids = sorted(self._seen)
