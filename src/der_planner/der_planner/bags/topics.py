@@ -8,6 +8,7 @@ installed share folders; `rosbags` parses and hashes them.
 
 from __future__ import annotations
 
+import importlib
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -52,6 +53,22 @@ def find_definition(type_name: str) -> Definition:
         DefinitionError: the type, or one that it contains, is not installed.
     """
     return _find(type_name, installed_prefixes())
+
+
+def message_class(type_name: str) -> Any:
+    """Return the class of a message type of ROS.
+
+    Raises:
+        DefinitionError: its package is not installed here.
+    """
+    package, _, short = type_name.split("/")
+    try:
+        return getattr(importlib.import_module(f"{package}.msg"), short)
+    except (ImportError, AttributeError) as error:
+        raise DefinitionError(
+            f"no class of the message type '{type_name}' ({error}): source the workspace of "
+            f"{package}, or leave its topics out"
+        ) from error
 
 
 @cache

@@ -213,7 +213,6 @@ def _check(given: argparse.Namespace) -> None:
         OptionError: names the option and what it may be.
     """
     for wrong, said in (
-        (given.csv and not given.columns, "--csv needs --columns FILE"),
         (given.hardware and not given.graph, "--hardware goes with --graph"),
         (given.folder and not given.graph, "--folder goes with --graph"),
         (

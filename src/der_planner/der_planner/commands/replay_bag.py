@@ -12,13 +12,11 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import importlib
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from rclpy.duration import Duration
 from rclpy.publisher import Publisher
@@ -27,6 +25,7 @@ from rosgraph_msgs.msg import Clock
 
 from der_planner.bags.reader import BagError, BagReader, RawMessage, RecordedTopic
 from der_planner.bags.record import NANOSECONDS
+from der_planner.bags.topics import DefinitionError, message_class
 from der_planner.experiment.client import GraphClient
 from der_planner.experiment.console import (
     OptionError,
@@ -50,7 +49,7 @@ def main() -> int:
     """Run the command line."""
     given = _arguments()
     interrupt_once()
-    return run_command(lambda: _replay(given), BagError, GraphError)
+    return run_command(lambda: _replay(given), BagError, DefinitionError, GraphError)
 
 
 # What is played ---------------------------------------------------------------------------------
@@ -143,22 +142,6 @@ def _stamp(data: bytes) -> bytes:
     return bytes(data[4:12])
 
 
-def message_class(type_name: str) -> Any:
-    """Return the class of a message type.
-
-    Raises:
-        BagError: its package is not installed here.
-    """
-    package, _, name = type_name.split("/")
-    try:
-        return getattr(importlib.import_module(f"{package}.msg"), name)
-    except (ImportError, AttributeError) as error:
-        raise BagError(
-            f"cannot publish {type_name}: {error}. Source the workspace of {package}, or leave its "
-            "topics out with --exclude"
-        ) from error
-
-
 class GraphOutput:
     """Publishes on the graph; waits for answers where asked to.
 
@@ -169,7 +152,7 @@ class GraphOutput:
         answer: topic of the answers.
 
     Raises:
-        BagError: a message cannot be published here.
+        DefinitionError: a message cannot be published here.
         GraphError: nothing answers.
     """
 

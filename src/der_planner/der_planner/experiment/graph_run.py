@@ -26,7 +26,6 @@ from der_planner.experiment.processes import (
     STOP_ORDER,
     GraphError,
     GraphSetup,
-    NodeError,
     NodeProcess,
     NodeSpec,
     board_line,
@@ -88,13 +87,10 @@ def running_graph(
             graph.stop()
             raise
         client.watch(())
-        failed = {name: code for name, code in graph.stop().items() if code != 0}
-    for name, code in failed.items():
-        process = graph.processes[name]
-        raise NodeError(
-            f"node '{name}' ended with exit code {code}. Its last words:\n"
-            f"{process.last_words()}\nThe whole log: {process.log}"
-        )
+        graph.stop()
+    for process in graph.processes.values():
+        if process.exit_code != 0:
+            raise process.failure("did not end in order")
 
 
 def _refuse_second_graph(client: GraphClient, specs: list[NodeSpec], own: int = 0) -> None:
@@ -285,10 +281,11 @@ class RunningGraph:
                 f"  WARNING: the limb may still be under pressure ({error}); close its air supply"
             )
 
-    def stop(self) -> dict[str, int]:
-        """Stop every node; return the exit codes by name."""
-        order = [name for name in STOP_ORDER if name in self.processes]
-        return {name: self.processes[name].stop() for name in order}
+    def stop(self) -> None:
+        """Stop every node."""
+        for name in STOP_ORDER:
+            if name in self.processes:
+                self.processes[name].stop()
 
 
 # The page of an experiment --------------------------------------------------------------------

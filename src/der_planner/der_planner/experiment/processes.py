@@ -364,6 +364,13 @@ class NodeProcess:
         complaints = [line for line in text if line.startswith("error:")]
         return "\n".join(complaints[-lines:] or text[-lines:])
 
+    def failure(self, what: str) -> NodeError:
+        """Return the error that says what became of the process, e.g. that it "died"."""
+        return NodeError(
+            f"node '{self.name}' {what} ({_describe(self.exit_code)}). Its last words:\n"
+            f"{self.last_words()}\nThe whole log: {self.log}"
+        )
+
     def check(self) -> None:
         """Raise if the process has ended.
 
@@ -371,10 +378,7 @@ class NodeProcess:
             NodeError: with the exit code, the last words and the log's path.
         """
         if not self.alive:
-            raise NodeError(
-                f"node '{self.name}' died ({_describe(self.exit_code)}). Its last words:\n"
-                f"{self.last_words()}\nThe whole log: {self.log}"
-            )
+            raise self.failure("died")
 
     def signal(self, number: int) -> None:
         """Send a signal to the process group if it still runs."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import re
 import time
@@ -19,7 +18,7 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
 from der_planner.bags.session import RecordingSession
-from der_planner.bags.topics import DefinitionError, OfferedQos, TopicSpec
+from der_planner.bags.topics import DefinitionError, OfferedQos, TopicSpec, message_class
 from der_planner.bags.writer import COMPRESSIONS, RUN_KEY, BagWriteError, BagWriter
 from limb_interfaces import parameters, topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
@@ -184,14 +183,13 @@ class Recorder(Node):
             return
         try:
             spec = TopicSpec.installed(name, type_name, qos)
-            package, _, short = type_name.split("/")
-            message_class = getattr(importlib.import_module(f"{package}.msg"), short)
-        except (DefinitionError, ImportError, AttributeError, ValueError) as error:
+            kind = message_class(type_name)
+        except DefinitionError as error:
             self._refuse(name, str(error))
             return
         source = self._sources[name] = _Source(spec)
         source.subscription = self.create_subscription(
-            message_class, name, partial(self._receive, source), _profile(spec), raw=True
+            kind, name, partial(self._receive, source), _profile(spec), raw=True
         )
 
     def _unsubscribe(self, name: str) -> None:

@@ -20,7 +20,7 @@ from der_planner.bags.run import RunSeries
 from der_planner.results.errors import error_series
 from der_planner.results.evaluation import DRAWN, RunResult
 from der_planner.results.statistics import learning_curves
-from der_planner.results.tables import CASE
+from der_planner.results.tables import CASE, several_limbs
 
 FORMATS = ("png", "pdf")
 CM = 100.0
@@ -87,7 +87,7 @@ def shared_legend(figure: Figure, axes: Iterable[Axes]) -> None:
 
 def by_motion(runs: Sequence[RunSeries]) -> dict[str, list[RunSeries]]:
     """Return the runs of each motion, and of each limb where there are several, by their title."""
-    several = len({run.description.namespace for run in runs} - {""}) > 1
+    several = several_limbs(run.description.namespace for run in runs)
     found: dict[str, list[RunSeries]] = {}
     for run in runs:
         about = run.description

@@ -169,7 +169,7 @@ Columns = dict[str, Callable[[RunResult], str]]
 
 
 def _first_columns(results: Sequence[RunResult]) -> Columns:
-    several = several_limbs(results)
+    several = several_limbs(run.namespace for run in results)
     return {
         "run": lambda run: (
             f"{run.namespace if several else ''} {run.motion} {run.model} {run.method}".strip()

@@ -7,11 +7,11 @@ import html
 import io
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import TypeVar
 
-from der_planner.results.evaluation import NEAREST, RunResult
+from der_planner.results.evaluation import NEAREST
 from der_planner.results.statistics import Comparison, Summary
 
 CASE = {
@@ -124,15 +124,15 @@ def _spread(mean: float, deviation: float) -> str:
     return number(mean, CM) + ("" if math.isnan(deviation) else f" ± {number(deviation, CM)}")
 
 
-def several_limbs(entries: Sequence[Summary] | Sequence[RunResult]) -> bool:
-    """Tell whether the entries are of limbs that have to be told apart."""
-    return len({entry.namespace for entry in entries} - {""}) > 1
+def several_limbs(namespaces: Iterable[str]) -> bool:
+    """Tell whether namespaces are of limbs that have to be told apart."""
+    return len(set(namespaces) - {""}) > 1
 
 
 def error_table(rows: Sequence[Summary]) -> Table:
     """Return the table of errors, a row per limb, loads, motion, model and method."""
     columns: dict[str, Callable[[Summary], str]] = {}
-    if several_limbs(rows):
+    if several_limbs(row.namespace for row in rows):
         columns["limb"] = lambda row: row.namespace
     if any(row.loads for row in rows):
         columns["loads"] = lambda row: row.loads or "horizontal"
