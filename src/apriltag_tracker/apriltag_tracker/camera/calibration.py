@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from apriltag_tracker.camera.images import check_grey
 from apriltag_tracker.camera.pinhole import Intrinsics
 from apriltag_tracker.pipeline import LimbTracker
 from apriltag_tracker.sheets import BoardLayout
@@ -73,15 +72,14 @@ class BoardFinder:
         self._detector = cv2.aruco.CharucoDetector(self._board)
 
     def find(self, image: NDArray[np.uint8], name: str) -> BoardView | None:
-        """Return the corners of the board, None if fewer than twelve are seen."""
-        gray = check_grey(image)
-        corners, ids, _, _ = self._detector.detectBoard(gray)
+        """Return the corners of the board in a grey image, None if fewer than twelve are seen."""
+        corners, ids, _, _ = self._detector.detectBoard(image)
         if ids is None or len(ids) < _LEAST_CORNERS:
             return None
         # Saddle points to a few hundredths of a pixel, in a window that no marker reaches into.
         pixels = np.ascontiguousarray(corners, dtype=np.float32).reshape(-1, 1, 2)
         stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 40, 1e-4)
-        pixels = cv2.cornerSubPix(gray, pixels, (4, 4), (-1, -1), stop)
+        pixels = cv2.cornerSubPix(image, pixels, (4, 4), (-1, -1), stop)
         points = np.asarray(self._board.getChessboardCorners(), dtype=np.float64)
         chosen = np.asarray(ids, dtype=np.int64).ravel()
         return BoardView(name, np.asarray(pixels, np.float64).reshape(-1, 2), points[chosen])
@@ -216,7 +214,7 @@ def calibrate_mounting(
     seen: dict[int, list[Array]] = {tag.id: [] for tag in tags.limb}
     count = 0
     for count, image in enumerate(images, 1):
-        observation = tracker.observe(check_grey(image), float(count))
+        observation = tracker.observe(image, float(count))
         for placed in observation.tags:
             if placed.on_limb and placed.pose is not None:
                 seen[placed.tag.id].append(placed.pose)

@@ -153,7 +153,7 @@ class Intrinsics:
                 f"{path} is no camera_info YAML ({error}): scripts/calibrate_camera.py writes one"
             ) from error
 
-    def to_yaml(self, path: str | Path, camera_name: str = "limb_camera") -> None:
+    def to_yaml(self, path: str | Path) -> None:
         """Write the calibration as the YAML that ROS's camera drivers read."""
         rational = bool(np.any(self.distortion[5:]))
         coefficients = self.distortion if rational else self.distortion[:5]
@@ -167,7 +167,7 @@ class Intrinsics:
         content = {
             "image_width": self.width,
             "image_height": self.height,
-            "camera_name": camera_name,
+            "camera_name": "limb_camera",
             "camera_matrix": block(self.matrix),
             "distortion_model": "rational_polynomial" if rational else "plumb_bob",
             "distortion_coefficients": block(coefficients),
@@ -257,13 +257,9 @@ def solve_pose(
         The pose and the reprojection residuals (n, 2) px.
 
     Raises:
-        CameraError: fewer than four points, no solution, or one that looks at the plane from below
-            (a mirror image, or a map with mirrored positions).
+        CameraError: no solution, or one that looks at the plane from below (a mirror image, or a
+            map with mirrored positions).
     """
-    if len(points) < 4:
-        raise CameraError(
-            f"{len(points)} fixed points: the camera pose needs four, one tag, at least"
-        )
     normalised = intrinsics.rays(pixels)
     identity = np.eye(3)
     if start is None:

@@ -25,7 +25,7 @@ class ShapeListener(Node):
 
     def __init__(self, name: str) -> None:
         super().__init__(name, namespace=topics.NAMESPACE)
-        self._frames = self._refused = 0
+        self._frames = 0
         self._last_shape = time.monotonic()
         self._busy = 0.0
 
@@ -48,15 +48,8 @@ class ShapeListener(Node):
     def _on_shape(self, message: LimbShape) -> None:
         started = time.perf_counter()
         self._last_shape = time.monotonic()
-        points = np.array([(point.x, point.y) for point in message.points]).reshape(-1, 2)
+        points = np.array([(point.x, point.y) for point in message.points])
         shape = Shape(np.array(message.arc_length), points, np.array(message.heading))
-        if (
-            len(points) < 2
-            or not len(points) == len(shape.arc_length) == len(shape.heading)
-            or not (np.isfinite(points).all() and np.all(np.diff(shape.arc_length) > 0.0))
-        ):
-            self._refused += 1
-            return
         self.show(stamps.nanoseconds(message.header.stamp), shape)
         self._frames += 1
         self._busy += time.perf_counter() - started
@@ -65,7 +58,6 @@ class ShapeListener(Node):
         silent = time.monotonic() - self._last_shape
         values = {
             "frames": self._frames,
-            "refused_shapes": self._refused,
             "render_ms": f"{1e3 * self._busy / max(self._frames, 1):.2f}",
         }
         if self._frames == 0:
@@ -73,6 +65,4 @@ class ShapeListener(Node):
         if silent > 1.0:
             said = f"no shape on {topics.TWIN_SHAPE} for {silent:.0f} s: is limb_twin running?"
             return Health("warning", said, values)
-        if self._refused:
-            return Health("warning", f"{self._refused} malformed shapes were left out", values)
         return Health("ok", "rendering", values)
