@@ -59,7 +59,7 @@ class PortError(RuntimeError):
 
 def available_ports() -> list[str]:
     """Return the serial ports of this machine, by their stable names where there are any."""
-    by_id = sorted(map(str, STABLE_NAMES.iterdir())) if STABLE_NAMES.is_dir() else []
+    by_id = sorted(map(str, STABLE_NAMES.glob("*")))
     known = {os.path.realpath(path) for path in by_id}
     others = [port.device for port in list_ports.comports() if port.device not in known]
     links = [path for path in Path("/tmp").glob("der_limb_board_*") if path.is_symlink()]
@@ -76,10 +76,9 @@ def stable_name(port: str) -> str:
             host, number = tcp_address(port)
             return f"tcp://{socket.gethostbyname(host)}:{number}"
         return port
-    if STABLE_NAMES.is_dir():
-        for path in sorted(STABLE_NAMES.iterdir()):
-            if os.path.realpath(path) == os.path.realpath(port):
-                return str(path)
+    for path in sorted(STABLE_NAMES.glob("*")):
+        if os.path.realpath(path) == os.path.realpath(port):
+            return str(path)
     return port
 
 

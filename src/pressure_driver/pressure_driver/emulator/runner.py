@@ -133,8 +133,6 @@ class EmulatedPort:
         os.set_blocking(master, False)
         self._tap = LineTap(device)
         temporary = self.link.with_name(f"{self.link.name}.{os.getpid()}")
-        with contextlib.suppress(FileNotFoundError):
-            temporary.unlink()
         temporary.symlink_to(device)
         temporary.replace(self.link)
         self._master = master

@@ -40,7 +40,7 @@ RAMP_TIME = 0.05
 _NUMBERS = r"(?:\t-?(?:\d{1,4}(?:\.\d{1,6})?|nan|inf))+"
 """Firmware prints nan or inf for a sensor that is broken: the driver judges that."""
 _REPORT = re.compile(r"\d{1,10}\t[012]" + _NUMBERS)
-_ECHO = re.compile(r"(?:NEW )?(?:SET|UNITS|MODE|TIME|ECHO|ON|OFF)\b")
+_ECHO = re.compile(r"(?:NEW )?(?:SET|UNITS|MODE|TIME|ECHO|ON|OFF|UNREC)\b")
 _UNITS_ECHO = re.compile(r"(?:NEW )?UNITS:?(?:\s+(?:1(?:\.0*)?|kPa)){1,2}\s*", re.IGNORECASE)
 _UNITS_UNKNOWN = "the board has not confirmed that it works in kPa"
 
@@ -130,8 +130,6 @@ class CtrlpHost(LineHost):
     def _parse_echo(self, text: str) -> Event:
         if text.startswith("NEW SET"):
             return Echo()
-        if text.startswith("UNREC"):
-            return BoardText("a command was not understood")
         if _UNITS_ECHO.fullmatch(text):
             self.unsettled = ""
         elif "UNITS" in text:
