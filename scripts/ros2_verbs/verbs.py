@@ -230,12 +230,17 @@ def param_list(options: argparse.Namespace) -> None:
                 print(f"  {name}")
 
 
-def param_get(options: argparse.Namespace) -> str | None:
-    """Print the value of a parameter."""
+def _ask_node(options: argparse.Namespace, kind: Any, service: str, **request: Any) -> Any:
+    """Return a node's answer to a request about its parameters."""
     with Session(options) as session:
         node = session.find_node(options.node_name)
-        request = GetParameters.Request(names=[options.parameter_name])
-        values = session.call(GetParameters, f"{node}/get_parameters", request).values
+        return session.call(kind, f"{node}/{service}", kind.Request(**request))
+
+
+def param_get(options: argparse.Namespace) -> str | None:
+    """Print the value of a parameter."""
+    names = [options.parameter_name]
+    values = _ask_node(options, GetParameters, "get_parameters", names=names).values
     if not values:
         return "Parameter not set"
     kind = TYPES[values[0].type]
@@ -247,12 +252,10 @@ def param_get(options: argparse.Namespace) -> str | None:
 
 def param_set(options: argparse.Namespace) -> None:
     """Set a parameter; its type is what the text is in YAML."""
-    with Session(options) as session:
-        node = session.find_node(options.node_name)
-        value = get_parameter_value(options.value)
-        parameter = Parameter(name=options.parameter_name, value=value)
-        request = SetParameters.Request(parameters=[parameter])
-        result = session.call(SetParameters, f"{node}/set_parameters", request).results[0]
+    value = get_parameter_value(options.value)
+    wanted = [Parameter(name=options.parameter_name, value=value)]
+    answer = _ask_node(options, SetParameters, "set_parameters", parameters=wanted)
+    result = answer.results[0]
     outcome = "Set parameter successful" if result.successful else "Setting parameter failed"
     reason = f": {result.reason}" if result.reason else ""
     # The real tool exits with 0 in both cases.
@@ -261,10 +264,8 @@ def param_set(options: argparse.Namespace) -> None:
 
 def param_describe(options: argparse.Namespace) -> None:
     """Print meaning, type and range of parameters."""
-    with Session(options) as session:
-        node = session.find_node(options.node_name)
-        request = DescribeParameters.Request(names=options.parameter_names)
-        answer = session.call(DescribeParameters, f"{node}/describe_parameters", request)
+    names = options.parameter_names
+    answer = _ask_node(options, DescribeParameters, "describe_parameters", names=names)
     for descriptor in answer.descriptors:
         _print_descriptor(descriptor)
 
