@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.interpolate import BSpline, PchipInterpolator, make_interp_spline
+from scipy.interpolate import BPoly, BSpline, PchipInterpolator, make_interp_spline
+from scipy.ndimage import uniform_filter1d
 
 from der_planner.arrays import Array
 from der_planner.model import CONTROL_PERIOD
@@ -141,15 +142,8 @@ def smooth_step(x: ArrayLike) -> Array:
 
 def quintic(time: Array, begin: Moving, end: Moving) -> Array:
     """Return (K, M) samples of the quintic between two states over the span of ``time`` (K,)."""
-    span = float(time[-1])
-    t = (time / span)[:, None]
-    x0, v0, a0 = begin[0], span * begin[1], span**2 * begin[2]
-    x1, v1, a1 = end[0], span * end[1], span**2 * end[2]
-    difference, slope, bow = x1 - x0 - v0 - 0.5 * a0, v1 - v0 - a0, a1 - a0
-    c3 = 10 * difference - 4 * slope + 0.5 * bow
-    c4 = -15 * difference + 7 * slope - bow
-    c5 = 6 * difference - 3 * slope + 0.5 * bow
-    return x0 + t * (v0 + t * (0.5 * a0 + t * (c3 + t * (c4 + t * c5))))
+    between = BPoly.from_derivatives([0.0, time[-1]], np.array([begin, end]))
+    return np.asarray(between(time))
 
 
 def on_grid(span: float) -> float:
@@ -262,14 +256,8 @@ def paced(place: Array, rate: Array, greatest: Array, rest: bool) -> tuple[Array
         )
     grid = np.linspace(0.0, time[-1], max(20, round(time[-1] / _GRID) + 1))
     step = float(grid[1])
-    along = _running_mean(PchipInterpolator(time, place)(grid), max(1, round(_SOFTNESS / step)))
+    # A running mean that begins and ends at rest is longer by as much.
+    around = max(1, round(_SOFTNESS / step))
+    padded = np.pad(PchipInterpolator(time, place)(grid), around, mode="edge")
+    along = uniform_filter1d(padded, 2 * around + 1, mode="nearest")
     return np.arange(len(along), dtype=np.float64) * step, along
-
-
-def _running_mean(values: Array, window: int) -> Array:
-    """Return a running mean over 2 window + 1 samples, longer by as much: from rest to rest."""
-    width = 2 * window + 1
-    padded = np.concatenate([np.full(width - 1, values[0]), values, np.full(width - 1, values[-1])])
-    total = np.concatenate([[0.0], np.cumsum(padded)])
-    mean: Array = (total[width:] - total[:-width]) / width
-    return mean

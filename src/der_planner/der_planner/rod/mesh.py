@@ -85,24 +85,24 @@ class Mesh:
     @property
     def node_mass(self) -> Array:
         """(N,) half the mass of the edges at each node, and what it carries: what weighs."""
-        return self._on_nodes(self.edge_mass)
+        return _on_nodes(self.edge_mass) + self.point_mass
 
     @property
     def swung_node_mass(self) -> Array:
         """(N,) the same of what resists acceleration."""
-        return self._on_nodes(self.swung_mass)
-
-    def _on_nodes(self, of_edges: Array) -> Array:
-        half = 0.5 * of_edges
-        total: Array = np.append(half, 0.0) + np.append(0.0, half) + self.point_mass
-        return total
+        return _on_nodes(self.swung_mass) + self.point_mass
 
     @property
     def node_damping(self) -> Array:
         """(N,) damping coefficient of each node [kg/s]."""
-        half = 0.5 * self.edge_mass * self.edge_damping
-        total: Array = np.append(half, 0.0) + np.append(0.0, half)
-        return total
+        return _on_nodes(self.edge_mass * self.edge_damping)
+
+
+def _on_nodes(of_edges: Array) -> Array:
+    """Return (N,) half of what the edges (N-1,) at each node have."""
+    half = 0.5 * of_edges
+    total: Array = np.append(half, 0.0) + np.append(0.0, half)
+    return total
 
 
 def interleave(of_nodes: Array, of_edges: Array) -> Array:
@@ -196,10 +196,7 @@ def masses_on_nodes(masses: Sequence[tuple[float, float]], rest: Array) -> Array
         not_negative(mass, f"masses[{index}] [kg]")
         inside = -1e-9 * ends[-1] <= place <= ends[-1] * (1 + 1e-9)
         require(inside, f"masses[{index}] at", f"within 0 … {ends[-1]:.6g} m", place)
-        edge = min(max(int(np.searchsorted(ends, place)) - 1, 0), len(rest) - 1)
-        share = min(max((place - ends[edge]) / rest[edge], 0.0), 1.0)
-        result[edge] += (1.0 - share) * mass
-        result[edge + 1] += share * mass
+        result += [mass * np.interp(place, ends, node) for node in np.eye(len(ends))]
     return result
 
 
@@ -224,7 +221,8 @@ def limb_mesh(limb: Limb, nodes: int, clamp: str) -> Mesh:
     before[-1] = after[-1] = 0.0
     if not ghost:
         after[0] = 0.0
-    behind, ahead = _nearest_owner(owner)
+    # The segments behind and ahead of each edge: the same one unless it is a connector.
+    behind, ahead = (np.where(owner < 0, np.roll(owner, by), owner) for by in (1, -1))
 
     def of_edges(name: str) -> Array:
         values = np.array([getattr(segment, name) for segment in limb.segments])
@@ -324,12 +322,3 @@ def _segment_edges(
         owner.extend([index] * int(size))
         rest.extend([float(span) / int(size)] * int(size))
     return np.array(owner, dtype=np.int64), np.array(rest), tuple(pairs)
-
-
-def _nearest_owner(owner: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the segments behind and ahead of each edge: the same one unless it is a connector."""
-    behind, ahead = owner.copy(), owner.copy()
-    for j in range(len(owner)):
-        if owner[j] < 0:
-            behind[j], ahead[j] = owner[j - 1], owner[j + 1]
-    return behind, ahead
