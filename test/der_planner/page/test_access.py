@@ -59,7 +59,7 @@ def test_a_taken_port_is_named_with_the_remedy() -> None:
         other.bind(("127.0.0.1", 0))
         other.listen()
         port = other.getsockname()[1]
-        with pytest.raises(AccessError, match=f"port {port}.*set the parameter 'port'"):
+        with pytest.raises(AccessError, match=rf"in use .*{port}.*set the parameter 'port'"):
             Binding(port=port).listen()
 
 

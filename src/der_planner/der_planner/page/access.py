@@ -110,17 +110,15 @@ class Binding:
             AccessError: the address is not this machine's, or the port is taken.
         """
         family = socket.AF_INET6 if ":" in self.address else socket.AF_INET
-        listener = socket.socket(family, socket.SOCK_STREAM)
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        both = family == socket.AF_INET6  # "::" is every address, also of the older kind
+        place = (self.address, self.port)
         try:
-            listener.bind((self.address, self.port))
+            return socket.create_server(place, family=family, dualstack_ipv6=both)
         except OSError as error:
-            listener.close()
             raise AccessError(
-                f"cannot listen on {self.address}, port {self.port} ({error.strerror}): set the "
-                "parameter 'port' to a free one, 'address' to one of this machine's"
+                f"{error.strerror}: set the parameter 'port' to a free one, 'address' to one of "
+                "this machine's"
             ) from error
-        return listener
 
 
 def _own_addresses() -> set[str]:

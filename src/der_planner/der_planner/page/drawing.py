@@ -140,7 +140,7 @@ class Preview:
         duration: [s].
         largest_pressure: largest |command| [Pa].
         predicted_error: mean distance of the predicted tip from the path [m].
-        deviation_mean, deviation_largest: of the path from the drawing [m].
+        deviation: how far the path is from the drawing, in words; empty if it follows it.
         warnings: of the plan, without the deviation.
         problem: why there is no plan; empty if there is one.
         place: (x, y) of the point of the drawing that is the reason [m]; None: it is none.
@@ -151,8 +151,7 @@ class Preview:
     duration: float = 0.0
     largest_pressure: float = 0.0
     predicted_error: float = 0.0
-    deviation_mean: float = 0.0
-    deviation_largest: float = 0.0
+    deviation: str = ""
     warnings: tuple[str, ...] = ()
     problem: str = ""
     place: tuple[float, float] | None = None
@@ -167,7 +166,7 @@ def preview(limb: Limb, tip: Array, limits: PathLimits, model: str, method: str)
         # Of a point that is out of reach, and of a load that is too much there.
         place: tuple[float, float] | None = getattr(error, "point", None)
         return Preview(np.empty((0, 2)), problem=str(error), place=place)
-    deviation = planned.reference.deviation
+    deviation = str(planned.reference.deviation or "")
     frames = np.linspace(0, len(planned.time) - 1, min(FRAMES, len(planned.time))).astype(int)
     return Preview(
         path=planned.tip_reference[:: max(1, len(planned.time) // PATH_POINTS)],
@@ -175,9 +174,8 @@ def preview(limb: Limb, tip: Array, limits: PathLimits, model: str, method: str)
         duration=planned.duration,
         largest_pressure=float(np.abs(planned.differential_pressure).max()),
         predicted_error=planned.predicted_error,
-        deviation_mean=deviation.mean if deviation else 0.0,
-        deviation_largest=deviation.largest if deviation else 0.0,
-        warnings=tuple(text for text in planned.warnings if text != str(deviation or "")),
+        deviation=deviation,
+        warnings=tuple(text for text in planned.warnings if text != deviation),
     )
 
 

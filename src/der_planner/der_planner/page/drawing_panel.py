@@ -23,8 +23,6 @@ from der_planner.page.situation import centimetres
 
 CURVE_POINTS = 30
 """A pose of the predicted limb is shown with about this many points."""
-FOLLOWED = 1e-3
-"""A drawing counts as followed as it is if the limb stays this near to it [m]."""
 
 
 class DrawingPanel:
@@ -205,11 +203,10 @@ def summary(found: Preview) -> str:
     if found.problem:
         return f"This cannot be played: {found.problem}"
     followed = "The limb follows this drawing"
-    if found.deviation_largest >= FOLLOWED:
+    if found.deviation:
         followed = (
-            "This drawing leaves what the limb reaches. The dashed line is the nearest path that "
-            f"it can follow, {found.deviation_mean * 100:.1f} cm away on average, "
-            f"{found.deviation_largest * 100:.1f} cm at most. It is followed"
+            f"This drawing leaves what the limb reaches: {found.deviation}. The dashed line, the "
+            "nearest path, is followed"
         )
     text = (
         f"{followed} in {found.duration:.1f} s, with {found.largest_pressure / 1000:.1f} kPa at "

@@ -350,35 +350,30 @@ def write_video(run: RunSeries, path: Path) -> Path:
             raise EvaluationError(f"{path_of_bag}: no camera calibration or too few limb tags")
         frames = ((time, _film_frame(shot, time, run, project)) for time, shot in images.pictures())
         write = _write_animation if path.suffix == ".webp" else _write_film
-        try:
-            written = write(run, path, frames)
-        except cv2.error:
-            written = None
-    if written == 0:
-        raise EvaluationError(
-            f"{path_of_bag}: no images of a known encoding; record them with record_images:=true"
-        )
-    if written is None:
-        raise EvaluationError(f"cannot write the film {path}: is its folder writable?")
+        if not write(run, path, frames):
+            raise EvaluationError(
+                f"{path_of_bag}: no images of a known encoding; record them with "
+                "record_images:=true"
+            )
     return path
 
 
-def _write_film(run: RunSeries, path: Path, frames: Frames) -> int | None:
-    """Write every frame; return how many, or None where the file cannot be written."""
+def _write_film(run: RunSeries, path: Path, frames: Frames) -> int:
+    """Write every frame; return how many."""
     rate, count = 1.0 / float(np.median(np.diff(run.tip.time))), 0
     film = cv2.VideoWriter()
     for _, frame in frames:
         size = (frame.shape[1], frame.shape[0])
         if not count and not film.open(str(path), cv2.VideoWriter.fourcc(*"mp4v"), rate, size):
-            return None
+            raise EvaluationError(f"OpenCV cannot write the film {path}")
         film.write(frame)
         count += 1
     film.release()
     return count
 
 
-def _write_animation(run: RunSeries, path: Path, frames: Frames) -> int | None:
-    """Write some frames of the motion; return how many, or None where it cannot be written."""
+def _write_animation(run: RunSeries, path: Path, frames: Frames) -> int:
+    """Write some frames of the motion; return how many."""
     animation, kept, due = cv2.Animation(), [], 0.0
     for time, frame in frames:
         if due <= time <= run.reference.time[-1]:
@@ -389,7 +384,7 @@ def _write_animation(run: RunSeries, path: Path, frames: Frames) -> int | None:
     animation.durations = [round(1000 * ANIMATION_STEP)] * len(kept)
     quality = [cv2.IMWRITE_WEBP_QUALITY, ANIMATION_QUALITY]
     if kept and not cv2.imwriteanimation(str(path), animation, quality):
-        return None
+        raise EvaluationError(f"OpenCV cannot write the film {path}")
     return len(kept)
 
 
