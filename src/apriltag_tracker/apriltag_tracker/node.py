@@ -47,8 +47,8 @@ class TrackerNode(LimbStateNode):
         )
         where = "where images come from: topic, /dev/videoN, a video file, or a folder of images"
         source = str(declare(self, "source", "topic", where))
-        rate = self.number("source_rate", 30.0, "images a second from a folder", 0.1, 500.0)
-        cv2.setNumThreads(int(self.number("threads", 1, "threads of OpenCV", 1, 64)))
+        rate = declare(self, "source_rate", 30.0, "images a second from a folder", 0.1, 500.0)
+        cv2.setNumThreads(declare(self, "threads", 1, "threads of OpenCV", 1, 64))
         self._map = TagMap.from_yaml(self.map_path)
         self._options = self._declare_options()
         self._detector = self._make_detector()
@@ -61,15 +61,14 @@ class TrackerNode(LimbStateNode):
         self._frame = ""
         self._level = ""
         self._image_topic = self.resolve_topic_name(topics.IMAGE)
-        self._watch = ImageWatch(
-            self._image_topic if source == "topic" else source, is_topic=source == "topic"
-        )
+        live = source == "topic"
+        self._watch = ImageWatch(self._image_topic if live else source, live)
         self.make_outputs(len(self._map.segment_lengths))
         self._annotated = self.create_publisher(Image, ANNOTATED_IMAGE, qos.SENSOR_DATA)
         if calibration:
             self._set_calibration(Intrinsics.from_yaml(str(calibration)))
         self._source: Source | None = None
-        if source == "topic":
+        if live:
             self._subscribe(needs_info=not calibration)
         else:
             self._source = self._open_source(source, rate)
@@ -96,22 +95,24 @@ class TrackerNode(LimbStateNode):
     def _declare_options(self) -> TrackerOptions:
         options = self.declare_following(TrackerOptions())
         heights = "of limb tags' heights, m"
-        height = self.number("height_sigma", options.uncertainty.height, heights, 0.0, 0.1)
+        height = declare(self, "height_sigma", options.uncertainty.height, heights, 0.0, 0.1)
         period = "s between searches of the whole image; 0 searches every image in full"
         return replace(
             options,
             uncertainty=replace(options.uncertainty, height=height),
-            full_search_period=self.number(
-                "full_search_period", options.full_search_period, period, 0.0, 60.0
+            full_search_period=declare(
+                self, "full_search_period", options.full_search_period, period, 0.0, 60.0
             ),
         )
 
     def _make_detector(self) -> Detector:
         family = self._map.family
-        shortest = self.number("smallest_tag", 14.0, "shortest side of a tag in px", 8.0, 500.0)
+        side = "shortest side of a tag in px"
+        shortest = declare(self, "smallest_tag", 14.0, side, 8.0, 500.0)
         forgiven = "wrong bits of a code that are forgiven in a search"
-        bits = self.number("correct_bits", family.correct_bits, forgiven, 0, family.most_corrected)
-        return Detector(shortest, int(bits), family=family)
+        usual, most = family.correct_bits, family.most_corrected
+        bits = declare(self, "correct_bits", usual, forgiven, 0, most)
+        return Detector(shortest, bits, family=family)
 
     def _subscribe(self, needs_info: bool) -> None:
         # A best-effort subscriber hears best-effort and reliable publishers alike.

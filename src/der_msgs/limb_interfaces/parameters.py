@@ -30,7 +30,6 @@ def declare(
     name: str,
     default: Value,
     description: str,
-    *,
     at_least: float | None = None,
     at_most: float | None = None,
     choices: tuple[str, ...] = (),
@@ -54,22 +53,16 @@ def declare(
     descriptor = ParameterDescriptor(description=description, read_only=read_only)
     if choices:
         descriptor.additional_constraints = "one of " + ", ".join(choices)
-    bounded = at_least is not None or at_most is not None
-    if bounded and isinstance(default, float):
-        descriptor.floating_point_range = [
-            FloatingPointRange(
-                from_value=-1e308 if at_least is None else float(at_least),
-                to_value=1e308 if at_most is None else float(at_most),
-            )
-        ]
-    elif bounded and isinstance(default, int):
-        descriptor.integer_range = [
-            IntegerRange(
-                from_value=-(2**62) if at_least is None else int(at_least),
-                to_value=2**62 if at_most is None else int(at_most),
-                step=0,
-            )
-        ]
+    if at_least is not None or at_most is not None:
+        number, widest = (float, 1e308) if isinstance(default, float) else (int, 2**62)
+        limits = {
+            "from_value": number(-widest if at_least is None else at_least),
+            "to_value": number(widest if at_most is None else at_most),
+        }
+        if number is float:
+            descriptor.floating_point_range = [FloatingPointRange(**limits)]
+        else:
+            descriptor.integer_range = [IntegerRange(**limits)]
     try:
         value = _declared(node, name, default, descriptor)
     except Exception as error:

@@ -28,13 +28,11 @@ class PoseTrackerNode(LimbStateNode):
     def __init__(self) -> None:
         super().__init__("pose_tracker", "body_map", "bodies.yaml", "body")
         kinds = tuple(FORMS)
-        self._form = str(
-            declare(self, "form", kinds[0], "messages in which poses come", choices=kinds)
-        )
+        self._form = declare(self, "form", kinds[0], "messages in which poses come", choices=kinds)
         named = "of the poses, with {body} for the name of a body; empty: that of the form"
         topic = str(declare(self, "topic", "", named))
-        self._period = 1.0 / self.number("rate", 60.0, "most states a second [Hz]", 1.0, 360.0)
-        noise, number = BodyNoise(), self.number
+        noise, number = BodyNoise(), functools.partial(declare, self)
+        self._period = 1.0 / number("rate", 60.0, "most states a second [Hz]", 1.0, 360.0)
         noise = BodyNoise(
             number("position_sigma", noise.position, "noise of a position, m", 1e-6, 0.01),
             number("direction_sigma", noise.direction, "noise of a direction, rad", 1e-5, 0.3),

@@ -6,6 +6,7 @@ It goes out as `state`, as markers for RViz and Foxglove, and as transforms for 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import importlib
 import math
 import time
@@ -53,20 +54,14 @@ class LimbStateNode(Node):
         where = f"YAML file: which {noun} is where"
         self.map_path = str(declare(self, map_parameter, str(share), where))
         late = "from an exposure to its stamp [s]"
-        self.sensor_delay = round(1e9 * self.number("sensor_delay", 0.0, late, -0.5, 0.5))
+        self.sensor_delay = round(1e9 * declare(self, "sensor_delay", 0.0, late, -0.5, 0.5))
         """To be taken off stamps [ns]."""
         self._noun = noun
         self._last_markers = 0.0
 
-    def number(
-        self, name: str, default: float, description: str, at_least: float, at_most: float
-    ) -> float:
-        """Declare a number; one whose default is whole is whole."""
-        return declare(self, name, default, description, at_least=at_least, at_most=at_most)
-
     def declare_following(self, usual: _Options) -> _Options:
         """Declare how the limb is followed; ``usual`` are the defaults."""
-        noun, sigma, number = self._noun, usual.uncertainty, self.number
+        noun, sigma, number = self._noun, usual.uncertainty, functools.partial(declare, self)
         missing = f"frames without limb {noun} that are bridged and marked"
         apart = f"distance in m from the others' shape at which a {noun} is left out"
         unsure = "standard deviation of the tip in m above which no tip is told"
@@ -80,7 +75,7 @@ class LimbStateNode(Node):
         )
         return dataclasses.replace(
             usual,
-            bridge_frames=int(number("bridge_frames", usual.bridge_frames, missing, 0, 100)),
+            bridge_frames=number("bridge_frames", usual.bridge_frames, missing, 0, 100),
             reject_beyond=number("reject_beyond", usual.reject_beyond, apart, 0.0, 0.1),
             largest_tip_sigma=number(
                 "largest_tip_sigma", usual.largest_tip_sigma, unsure, 0.0, 1.0

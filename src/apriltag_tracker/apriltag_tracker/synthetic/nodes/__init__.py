@@ -13,7 +13,6 @@ from apriltag_tracker.synthetic.shapes import Shape
 from der_msgs.msg import LimbShape
 from limb_interfaces import stamps, topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
-from limb_interfaces.parameters import declare
 
 
 class ShapeListener(Node):
@@ -28,13 +27,6 @@ class ShapeListener(Node):
         self._frames = 0
         self._last_shape = time.monotonic()
         self._busy = 0.0
-
-    def number(
-        self, name: str, default: float, description: str, at_most: float, at_least: float = 0.0
-    ) -> float:
-        """Declare a number."""
-        bounds = {"at_least": at_least, "at_most": at_most}
-        return float(declare(self, name, float(default), description, **bounds))
 
     def listen(self, hardware: str, profile: QoSProfile) -> None:
         """Begin, once everything is ready; ``hardware`` names in the diagnostics what it is."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import array
+import functools
 import time
 from pathlib import Path
 
@@ -45,18 +46,19 @@ class SyntheticCameraNode(ShapeListener):
             "YAML file: lens and place of the rendered camera",
         )
         seed = declare(self, "seed", 0, "of noise, floor and set-up errors", at_least=0)
-        number = self.number
+        number = functools.partial(declare, self)
+        blurred, lit = "blur of the lens, standard deviation in px", "light's range over its mean"
         optics = Optics(
-            noise=number("noise", Optics.noise, "noise of a pixel, grey levels", 30.0),
-            blur=number("blur", Optics.blur, "blur of the lens, standard deviation in px", 4.0),
-            exposure=number("exposure", Optics.exposure, "exposure time in s", 0.1),
-            light_fall=number("light_fall", Optics.light_fall, "light's range over its mean", 1.0),
+            noise=number("noise", Optics.noise, "noise of a pixel, grey levels", 0.0, 30.0),
+            blur=number("blur", Optics.blur, blurred, 0.0, 4.0),
+            exposure=number("exposure", Optics.exposure, "exposure time in s", 0.0, 0.1),
+            light_fall=number("light_fall", Optics.light_fall, lit, 0.0, 1.0),
         )
         surveyed, mounted = "how far fixed tags are from the tag map, in m", "the same of limb tags"
         errors = Errors(
-            survey=number("survey_error", 0.0, surveyed, 0.01),
-            mounting=number("mounting_error", 0.0, mounted, 0.01),
-            mounting_angle=number("mounting_angle_error", 0.0, "limb tags' turn, in rad", 0.3),
+            survey=number("survey_error", 0.0, surveyed, 0.0, 0.01),
+            mounting=number("mounting_error", 0.0, mounted, 0.0, 0.01),
+            mounting_angle=number("mounting_angle_error", 0.0, "limb tags' turn, in rad", 0.0, 0.3),
         )
         check_overrides(self)
         tags = TagMap.from_yaml(str(tag_map))
