@@ -81,18 +81,14 @@ class RestPressures:
         self._largest_drift = REST_DRIFT + resolution / 2.0
         self._largest_offset = LARGEST_OFFSET + resolution
         self._window: deque[tuple[float, Sequence[float]]] = deque()
-        self._problem = NOT_STEADY
+        self.problem = NOT_STEADY
+        """Why the newest reading ended no measurement; empty if it did."""
         self._lowest = [math.inf] * chamber_count
 
     @property
     def known(self) -> bool:
         """Whether every chamber's rest pressure has been measured or given."""
         return math.isfinite(self.mean)
-
-    @property
-    def problem(self) -> str:
-        """Why the rest pressures are not known; nothing if they are."""
-        return "" if self.known else f"the rest pressures are not measured yet: {self._problem}"
 
     def forget_readings(self) -> None:
         """Begin the next measurement afresh."""
@@ -106,8 +102,8 @@ class RestPressures:
         window.append((now, reading))
         while now - window[0][0] > 1.5 * REST_TIME:
             window.popleft()
-        self._problem = self._unfit(reading)
-        if self._problem:
+        self.problem = self._unfit(reading)
+        if self.problem:
             window.clear()
             return
         half = len(window) // 2
@@ -116,7 +112,7 @@ class RestPressures:
             abs(fmean(values[half:]) - fmean(values[:half])) > self._largest_drift
             for values in chambers
         ):
-            self._problem = NOT_STEADY
+            self.problem = NOT_STEADY
             return
         self.pressure = [fmean(values) for values in chambers]
         self.mean = fmean(self.pressure)
@@ -317,8 +313,9 @@ class TelemetryMonitor:
                 "a chamber is below its rest pressure: the rest was measured with air trapped; "
                 + self.describe_gauge()
             )
-        if problem := self.rest.problem:
-            yield Condition(problem, lasting=False)
+        if not self.rest.known:
+            text = f"the rest pressures are not measured yet: {self.rest.problem}"
+            yield Condition(text, lasting=False)
         elif not self.vented():
             text = "the chambers are not vented yet: " + self.describe_gauge()
             yield Condition(text, lasting=False)
