@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -59,31 +61,31 @@ time.sleep(0.5)
 """
 
 
-def _recorder(folder: Path) -> NodeProcess:
-    parameters = {"output": str(folder / "bag"), "autostart": True, "record_images": True}
-    return NodeProcess("der_planner", "recorder", parameters, folder)
-
-
-def _play_source(seconds: float) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [sys.executable, "-c", SOURCE, str(seconds)], stdout=subprocess.PIPE, text=True
-    )
+@contextlib.contextmanager
+def _recording(seconds: float) -> Iterator[tuple[Path, NodeProcess, subprocess.Popen[str]]]:
+    """Record a source of images that lasts some seconds; yield its folder and both processes."""
+    with tempfile.TemporaryDirectory(dir=os.environ.get("BENCHMARK_FOLDER")) as name:
+        bag = str(Path(name) / "bag")
+        parameters = {"output": bag, "autostart": True, "record_images": True}
+        recorder = NodeProcess("der_planner", "recorder", parameters, Path(name))
+        command = [sys.executable, "-c", SOURCE, str(seconds)]
+        source = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        try:
+            yield Path(name), recorder, source
+        finally:
+            source.kill()
+            source.wait()
+            recorder.stop(timeout=30.0)
 
 
 def record_images(seconds: float) -> dict[str, float]:
     """Record 720p mono8 images and six other topics at 30 Hz; count what is missing."""
-    with tempfile.TemporaryDirectory(dir=os.environ.get("BENCHMARK_FOLDER")) as name:
-        folder = Path(name)
-        process = _recorder(folder)
-        source = _play_source(seconds)
-        try:
-            time.sleep(2.0)
-            begin, used = time.monotonic(), process.measure_cpu()
-            source.wait(seconds + 60.0)
-            cpu = (process.measure_cpu() - used) / (time.monotonic() - begin)
-        finally:
-            source.kill()
-            process.stop(timeout=30.0)
+    with _recording(seconds) as (folder, recorder, source):
+        time.sleep(2.0)
+        begin, used = time.monotonic(), recorder.measure_cpu()
+        source.wait(seconds + 60.0)
+        cpu = (recorder.measure_cpu() - used) / (time.monotonic() - begin)
+        recorder.stop(timeout=30.0)
         with BagReader(folder / "bag") as bag:
             counts = {n: t.message_count for n, t in bag.topics.items()}
         size = sum(path.stat().st_size for path in (folder / "bag").glob("*.mcap"))
@@ -102,18 +104,12 @@ def record_images(seconds: float) -> dict[str, float]:
 
 def kill_and_recover(seconds: float) -> dict[str, float]:
     """Kill the recorder while it records images; how much time is missing at the end?"""
-    with tempfile.TemporaryDirectory(dir=os.environ.get("BENCHMARK_FOLDER")) as name:
-        folder = Path(name)
-        process = _recorder(folder)
-        source = _play_source(seconds + 30.0)
-        try:
-            time.sleep(4.0 + seconds)
-            killed = time.time_ns()
-            process.signal(signal.SIGKILL)
-            process.stop()
-        finally:
-            source.kill()
-            source.wait()
+    with _recording(seconds + 30.0) as (folder, recorder, source):
+        time.sleep(4.0 + seconds)
+        killed = time.time_ns()
+        recorder.signal(signal.SIGKILL)
+        recorder.stop()
+        source.kill()
         size = sum(path.stat().st_size for path in (folder / "bag").glob("*.mcap"))
         begin = time.perf_counter()
         found = recover_bag(folder / "bag")
