@@ -79,11 +79,16 @@ def test_loads_that_cannot_be_are_refused(table, monkeypatch, capsys):
     for wrong, reason in (
         (("--mounting", "upside"), "mounting 'upside' is unknown"),
         (("--payload", 0.05, "--payload-at", 0.7), "at most the limb's length"),
-        (("--payload", 20), "--payload is 20.0 kg: choose 0 to 10; 20 g are 0.02"),
-        (("--payload", "nan"), "--payload is nan kg"),
+        (("--payload", 20), "the payload of 20 kg is 77 times the limb's mass: give kg"),
+        (("--payload", "nan"), "must be at least 0 kg, got nan"),
         (("--payload-at", 0.1), "give --payload, too"),
-        (("--payload", 0.05, "--payload-at", -0.1), "--payload-at is -0.1 m"),
-        (("--mass", 310), "--mass is 310.0 kg: choose 0.001 to 10; 310 g are 0.31"),
+        (("--payload", 0.05, "--payload-at", -0.1), "arc_length must be at least 0 m, got -0.1"),
+        (("--mass", 310), "310 kg are 1192 times what the limb file says, 0.26 kg: give kg"),
+        (
+            ("--weight", 310, "--at", 0.2),
+            "the weight of 310 kg is 1192 times the limb's mass",
+        ),
+        (("--weight", 0.05, "--at", 0.4), "the weight's arc_length must be at most"),
         (("--mass", 0.3, "--fit-mass"), "choose one of the two"),
     ):
         assert run(calibrate_limb, *given, *wrong, monkeypatch=monkeypatch) != 0

@@ -74,7 +74,7 @@ def test_each_command_has_the_loads_of_its_time():
     tilted = loaded(payload=0.03, mounting="10")
     assert tilted.payload == (0.03, 0.0)
     assert tilted.gravity[:2] == (0.0, pytest.approx(-1.7035, abs=1e-4))
-    with pytest.raises(ValueError, match=r"the payload is -0\.1 kg"):
+    with pytest.raises(ValueError, match=r"must be at least 0 kg, got -0\.1"):
         loaded(payload=-0.1)
 
 

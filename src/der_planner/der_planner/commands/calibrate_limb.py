@@ -40,7 +40,6 @@ from der_planner.experiment.console import (
     add_load_options,
     check_file,
     check_folder,
-    check_kilograms,
     command_parser,
     interrupt_once,
     run_command,
@@ -74,8 +73,6 @@ from der_planner.limb import Limb, LimbError
 from der_planner.planning.loads import nearly_buckling
 from pressure_driver.settings import Settings
 
-LIGHTEST = 1e-3
-"""A limb of less [kg] is a mistake in the unit."""
 LAST_PART = 0.25
 """Share of a LOG that is kept back to judge the fit."""
 SAME_MASS = 0.01
@@ -97,6 +94,8 @@ def _main(given: argparse.Namespace) -> int:
     loads = Loads.given(given)
     bare = Limb.from_yaml(given.prior) if given.prior else Limb.default()
     prior = loads.loaded(bare if given.mass is None else bare.weighing(given.mass))
+    if given.weight is not None:
+        prior.carrying(given.weight, given.at, name="weight")  # refuses what cannot hang there
     if given.excitation:
         run = _excitation(prior, prior.pneumatics.pressure_limit, given)
         write_excitation(run, given.excitation)
@@ -235,10 +234,6 @@ def _check(given: argparse.Namespace) -> None:
     ):
         if wrong:
             raise OptionError(said)
-    if given.mass is not None:
-        check_kilograms("--mass", given.mass, LIGHTEST)
-    if given.weight is not None:
-        check_kilograms("--weight", given.weight, LIGHTEST)
     if given.excitation:
         check_file(given.excitation, "--excitation")
         return

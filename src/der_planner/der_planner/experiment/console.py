@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import math
 import os
 import signal
 import sys
@@ -15,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 
-from der_planner.limb import HEAVIEST, Limb, LimbError, gravity_of
+from der_planner.limb import Limb
 
 
 class OptionError(ValueError):
@@ -190,32 +189,25 @@ class Loads:
         """Return the loads of a command line that has `add_load_options`.
 
         Raises:
-            OptionError: an unknown mounting, a payload in grams, or the place of no payload.
+            OptionError: the place of no payload.
         """
-        try:
-            if given.mounting:
-                gravity_of(given.mounting)
-        except LimbError as error:
-            raise OptionError(f"--mounting: {error}") from error
-        check_kilograms("--payload", given.payload, 0.0)
-        at = given.payload_at
-        if at is not None and not given.payload:
+        if given.payload_at is not None and not given.payload:
             raise OptionError("--payload-at is the place of a payload: give --payload, too")
-        if at is not None and not (math.isfinite(at) and at >= 0):
-            raise OptionError(
-                f"--payload-at is {at} m: choose 0 to the limb's length, from the clamp"
-            )
-        return cls(given.mounting, given.payload, at)
+        return cls(given.mounting, given.payload, given.payload_at)
 
     def mounted(self, limb: Limb) -> Limb:
-        """Return a limb as it is mounted here, without the payload."""
+        """Return a limb as it is mounted here, without the payload.
+
+        Raises:
+            LimbError: the mounting is unknown.
+        """
         return limb.mounted(self.mounting) if self.mounting else limb
 
     def loaded(self, limb: Limb) -> Limb:
         """Return a limb as it is mounted here, with the payload.
 
         Raises:
-            LimbError: the payload is not on the limb.
+            LimbError: the mounting is unknown, or the payload is too heavy or not on the limb.
         """
         return self.mounted(limb).carrying(self.payload, self.payload_at)
 
@@ -245,15 +237,3 @@ def add_load_options(parser: argparse.ArgumentParser | argparse._ArgumentGroup) 
         metavar="M",
         help="where the payload sits, along the limb from its clamp (without it: the tip)",
     )
-
-
-def check_kilograms(name: str, mass: float, least: float) -> None:
-    """Refuse a mass [kg] that no limb has or carries.
-
-    Raises:
-        OptionError: names the option, and the mass in kg of what may have been given in g.
-    """
-    if least <= mass <= HEAVIEST:
-        return
-    grams = f"; {mass:g} g are {mass / 1000:g}" if HEAVIEST < mass <= 1000 * HEAVIEST else ""
-    raise OptionError(f"{name} is {mass} kg: choose {least:g} to {HEAVIEST:g}{grams}")

@@ -313,8 +313,6 @@ class NodeProcess:
         self.name = name or executable
         self.executable = executable
         self.log = folder / f"{self.name}.log"
-        self.cpu_seconds = 0.0
-        """User and system time that the process had used when it was last looked at [s]."""
         folder.mkdir(parents=True, exist_ok=True)
         parameter_file = folder / f"{self.name}.yaml"
         parameter_file.write_text(
@@ -333,7 +331,7 @@ class NodeProcess:
                 stderr=subprocess.STDOUT,
                 start_new_session=True,
                 preexec_fn=_die_with_parent,  # noqa: PLW1509 - it allocates nothing
-                env=None if environment is None else dict(environment),
+                env=environment,
             )
 
     @property
@@ -352,11 +350,9 @@ class NodeProcess:
         return self.exit_code is None
 
     def measure_cpu(self) -> float:
-        """Return the CPU time used so far [s] and the last known one after the end."""
-        with contextlib.suppress(OSError, ValueError, IndexError):
-            fields = Path(f"/proc/{self.pid}/stat").read_text().rsplit(")", 1)[1].split()
-            self.cpu_seconds = (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-        return self.cpu_seconds
+        """Return the user and system time [s] that the process, which runs, has used so far."""
+        fields = Path(f"/proc/{self.pid}/stat").read_text().rsplit(")", 1)[1].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
     def last_words(self, lines: int = 6) -> str:
         """Return the end of the log, preferring what the node called an error."""
@@ -388,7 +384,6 @@ class NodeProcess:
 
     def stop(self, timeout: float = 20.0) -> int:
         """End it with SIGTERM, after ``timeout`` seconds with SIGKILL; return the exit code."""
-        self.measure_cpu()
         self.signal(signal.SIGTERM)
         try:
             self._process.wait(timeout)

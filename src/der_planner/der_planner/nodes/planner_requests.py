@@ -284,8 +284,6 @@ def _request(
     """
     start = start_of(nanoseconds(message.header.stamp), now)
     limb = options.limb.mounted(message.mounting) if message.mounting else options.limb
-    if message.payload < 0 or message.payload > HEAVIEST:
-        raise ValueError(f"the payload is {message.payload} kg: give 0 to {HEAVIEST:g} kg")
     load = message if message.payload else options
     limb = limb.carrying(load.payload, load.payload_at or None)
     model, learned = message.model or options.model, None

@@ -126,16 +126,17 @@ class Recorder(Node):
         declare("flush_interval", 1.0, "time between flushes [s]", at_least=0.05, at_most=60.0)
         declare("queue_size", 256 << 20, "bytes that may wait for the disk", at_least=1 << 20)
         declare("minimum_free", 64 << 20, "stop below so many free bytes; 0: never", at_least=0)
-        self._wanted = self._pattern("topics")
-        self._unwanted = self._pattern("exclude")
+        self._wanted = self._pattern("topics", ".*")
+        self._unwanted = self._pattern("exclude", "")
 
     def _parameter(self, name: str):
         return self.get_parameter(name).value
 
-    def _pattern(self, name: str) -> re.Pattern[str] | None:
+    def _pattern(self, name: str, without: str) -> re.Pattern[str]:
+        """Return a parameter's pattern; ``without`` where it is empty."""
         text = self._parameter(name)
         try:
-            return re.compile(text) if text else None
+            return re.compile(text or without)
         except re.error as error:
             raise parameters.ParameterError(
                 f"parameter '{name}' is '{text}', no regular expression: {error}"
@@ -169,9 +170,7 @@ class Recorder(Node):
     def _is_wanted(self, name: str, type_name: str) -> bool:
         if type_name == IMAGE_TYPE and not self._parameter("record_images"):
             return False
-        if self._wanted is not None and not self._wanted.fullmatch(name):
-            return False
-        return self._unwanted is None or not self._unwanted.fullmatch(name)
+        return bool(self._wanted.fullmatch(name)) and not self._unwanted.fullmatch(name)
 
     def _refuse(self, name: str, reason: str) -> None:
         if name not in self._refused:
