@@ -15,7 +15,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import Image
 
-from apriltag_tracker.camera import Intrinsics, calibration
+from apriltag_tracker.camera import CameraPose, Intrinsics, calibration, project
 from apriltag_tracker.camera.calibration import BoardView, CalibrationError, calibrate_mounting
 from apriltag_tracker.commands import calibrate_camera
 from apriltag_tracker.commands.calibrate_camera import from_bag, from_topic
@@ -52,8 +52,7 @@ def corner_views(count, noise, tilt=0.5, seed=0):
     points = np.asarray(LAYOUT.board().getChessboardCorners(), dtype=float)
     views = []
     for k, (rotation, translation) in enumerate(poses(count, random, tilt)):
-        inside = points @ rotation.T + translation
-        pixels = TRUE.pixels(inside[:, :2] / inside[:, 2:])
+        pixels = project(TRUE, CameraPose(rotation, translation), points)
         seen = ((pixels > 5) & (pixels < (634, 474))).all(axis=1)
         pixels = pixels + random.normal(0.0, noise, pixels.shape)
         views.append(BoardView(f"view {k}", pixels[seen], points[seen]))

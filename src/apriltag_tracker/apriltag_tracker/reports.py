@@ -62,15 +62,14 @@ class ImageWatch(StreamWatch):
             publishers: how many publish the image topic.
         """
         if silence := self.silence():
-            return self._silence(silence, publishers)
+            return self._silence(*silence, publishers)
         if tracker is None:
             return "error", self.calibration_problem or NO_CALIBRATION
         if self.image_problem:
             return "error", self.image_problem
         return self._tracking(tracker)
 
-    def _silence(self, text: str, publishers: int) -> tuple[str, str]:
-        level = self.silence_level
+    def _silence(self, level: str, text: str, publishers: int) -> tuple[str, str]:
         if not self._is_topic:
             return "error", self.image_problem or text
         if publishers == 0:

@@ -80,17 +80,16 @@ class StreamWatch:
         self._latency.append(latency)
         self._work.append(work)
 
-    def silence(self) -> str:
-        """Return what to say of a stream that is silent, or nothing."""
+    def silence(self) -> tuple[str, str] | None:
+        """Return the level and what to say of a stream that is silent.
+
+        The level is ``stale`` before the first, ``error`` for a stream that stopped.
+        """
         silent = self._clock() - (self._arrivals[-1] if self._arrivals else self._started)
         if self._arrivals and silent <= SILENCE:
-            return ""
-        return f"no {self._noun} from {self._source} for {silent:.0f} s"
-
-    @property
-    def silence_level(self) -> str:
-        """``stale`` before the first, ``error`` for a stream that stopped."""
-        return "error" if self._arrivals else "stale"
+            return None
+        said = f"no {self._noun} from {self._source} for {silent:.0f} s"
+        return "error" if self._arrivals else "stale", said
 
     def values(self) -> dict[str, object]:
         """Return the numbers by name."""

@@ -101,8 +101,8 @@ class PoseTrackerNode(LimbStateNode):
             why = "are its poses of the bodies of the body map?"
             if not self.count_publishers(self._first_topic):
                 why = "nobody publishes it: start its tracker, or set the parameters form and topic"
-            said = self._problem or f"{silence}: {why}{others}"
-            return Health(self._watch.silence_level, said, values)
+            level, text = silence
+            return Health(level, self._problem or f"{text}: {why}{others}", values)
         if error := tracker.base.problem or self._problem:
             return Health("error", error, values)
         if self._reason:

@@ -181,12 +181,6 @@ class Intrinsics:
         points = np.ascontiguousarray(pixels, dtype=np.float64).reshape(-1, 2)
         return np.asarray(undistort_pixels(points, self.matrix, self.distortion))
 
-    def pixels(self, normalised: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return pixels (n, 2) of normalised coordinates (n, 2), lens distortion added."""
-        points, still = np.column_stack([normalised, np.ones(len(normalised))]), np.zeros(3)
-        found, _ = cv2.projectPoints(points, still, still, self.matrix, self.distortion)
-        return np.asarray(found, dtype=np.float64).reshape(-1, 2)
-
 
 @dataclass(frozen=True)
 class CameraPose:
@@ -219,11 +213,6 @@ class CameraPose:
         """Where the camera is in `limb_base`, (3,) m."""
         return np.asarray(-self.rotation.T @ self.translation)
 
-    def normalised(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return normalised image coordinates (n, 2) of points (n, 3) in `limb_base`."""
-        inside = points @ self.rotation.T + self.translation
-        return np.asarray(inside[:, :2] / inside[:, 2:3])
-
     def onto_plane(self, rays: NDArray[np.float64], height: float) -> NDArray[np.float64]:
         """Return where rays (n, 2) meet the plane at a height [m] over the base, (n, 2) m."""
         directions = rays @ self.rotation[:2] + self.rotation[2]
@@ -236,7 +225,10 @@ def project(
     intrinsics: Intrinsics, pose: CameraPose, points: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return the pixels (n, 2) of points (n, 3) in `limb_base`."""
-    return intrinsics.pixels(pose.normalised(np.asarray(points, dtype=np.float64)))
+    turn, _ = cv2.Rodrigues(pose.rotation)
+    lens = intrinsics.matrix, intrinsics.distortion
+    found, _ = cv2.projectPoints(points, turn, pose.translation, *lens)
+    return np.asarray(found, dtype=np.float64).reshape(-1, 2)
 
 
 def solve_pose(
