@@ -57,7 +57,7 @@ class Following:
         self._command = 0.0
         self._gauge = math.nan
         self._upper = self._lower = 0.0
-        self._time: float | None = None
+        self._time = math.inf
         self._outside = Duration()
         self._leaks = LeakWatch(self._name, settings)
 
@@ -70,12 +70,11 @@ class Following:
 
     def _move_envelope(self, now: float) -> None:
         """Let the slowest admissible response approach the command."""
-        if self._time is not None:
-            passed = max(now - self._time, 0.0)
-            decay = math.exp(-passed / self._settings.slowest_vent)
-            self._upper = self._command + (self._upper - self._command) * decay
-            risen = self._lower + passed * self._settings.slowest_fill
-            self._lower = min(risen, self._command)
+        passed = max(now - self._time, 0.0)
+        decay = math.exp(-passed / self._settings.slowest_vent)
+        self._upper = self._command + (self._upper - self._command) * decay
+        risen = self._lower + passed * self._settings.slowest_fill
+        self._lower = min(risen, self._command)
         self._time = now
 
     def receive(self, gauge: float, opening: float, now: float) -> None:

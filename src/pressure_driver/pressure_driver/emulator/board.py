@@ -137,16 +137,8 @@ class EmulatedBoard:
         self._offset: NDArray[np.float64] = self._generator.uniform(0.0, SENSOR_OFFSET, count)
         self._chunks: deque[tuple[int, int]] = deque()
         self._stream_length = 0
-        self._time = 0.0
-        self._valid_until: float | None = None
-        self._sequence = 0
-        self._target = np.full(count, pneumatics.atmosphere)
-        self._vented = True
-        self._expired = False
         self._unsaid = b""
         self._dead_for = 0.0
-        self.atmosphere = 0.0
-        """[Pa] what the board takes for the room's pressure, measured when it boots."""
         self.boot()
 
     def boot(self) -> bytes:
@@ -156,6 +148,7 @@ class EmulatedBoard:
         self._sequence = 0
         self._time = 0.0
         self.atmosphere = float(np.mean(self.pneumatics.pressure + self._offset))
+        """[Pa] what the board takes for the room's pressure."""
         return self.protocol.boot(self.atmosphere)
 
     def restart(self, seconds: float) -> None:
@@ -238,7 +231,7 @@ class EmulatedBoard:
 
     def _vent(self) -> None:
         self._target = np.full(self.pneumatics.chamber_count, self.pneumatics.atmosphere)
-        self._valid_until = None
+        self._valid_until: float | None = None
         self._vented = True
         self._apply()
 

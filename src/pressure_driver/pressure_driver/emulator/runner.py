@@ -322,7 +322,6 @@ class BoardRunner:
             while self._requests:
                 self._apply(self._requests.popleft(), now)
             if now >= self._replug_at:
-                self._replug_at = math.inf
                 self.port.plug()
             if now >= next_air or now >= next_telemetry:
                 elapsed = (now - air_time) / NANOSECONDS

@@ -150,26 +150,17 @@ class StreamCutter(FrameBuffer):
         super().__init__()
         self._end = end
         self._longest = longest
-        self._overlong = False
 
     def feed(self, data: bytes) -> list[tuple[int, Any]]:
         """Return (place of the first byte, bytes without their end); None for too many."""
         pieces: list[tuple[int, bytes | None]] = []
         self.kept += data
         while (end := self.kept.find(self._end)) >= 0:
-            too_long = self._overlong or end > self._longest
             place, piece = self.position, self.take(end + 1)[:-1]
-            pieces.append((place, None if too_long else piece))
-            self._overlong = False
-        if len(self.kept) > self._longest:
-            self.take(len(self.kept))
-            self._overlong = True
+            pieces.append((place, piece if end <= self._longest else None))
+        # One byte more than allowed is enough to know later that there were too many.
+        self.take(max(len(self.kept) - self._longest - 1, 0))
         return pieces
-
-    def reset(self) -> None:
-        """Forget a half-received piece."""
-        super().reset()
-        self._overlong = False
 
 
 class LineSplitter(StreamCutter):
