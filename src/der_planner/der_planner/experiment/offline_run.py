@@ -59,11 +59,7 @@ def play_offline(run: TrialRun, progress: Progress) -> dict[str, Any]:
         tip_estimated=played.estimated_tip,
         missing_pressure=played.missing_pressure,
     )
-    return {
-        "arrays": str(path.relative_to(run.options.out)),
-        "solve_time_s": planned.solve_time,
-        "predicted_error_m": planned.predicted_error,
-    }
+    return {"arrays": str(path.relative_to(run.options.out))}
 
 
 def _play(planned: Plan, run: TrialRun) -> tuple[Played, dict[str, Any]]:

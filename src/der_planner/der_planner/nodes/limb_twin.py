@@ -149,8 +149,6 @@ class LimbTwinNode(Node):
         try:
             while not self._stop.is_set():
                 self._stop.wait(self._loop.tick(time.monotonic()))
-        except TwinError as error:
-            self.fatal_error = str(error)
         except Exception as error:
             if rclpy.ok() and not self._stop.is_set():
                 self.fatal_error = f"the physics thread failed: {error!r}"

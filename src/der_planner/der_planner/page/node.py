@@ -23,8 +23,8 @@ from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo, Image
 from visualization_msgs.msg import MarkerArray
 
-from apriltag_tracker.camera import CameraError, Intrinsics
-from apriltag_tracker.camera.images import ImageError, ImageReader
+from apriltag_tracker.camera import Intrinsics
+from apriltag_tracker.camera.images import ImageReader
 from apriltag_tracker.detection import Tag
 from apriltag_tracker.tag_map import TagMap
 from der_msgs.msg import (
@@ -216,14 +216,11 @@ class PageNode(Node):
                 self._overlay.put_shape("planned", _points(marker.points))
 
     def _on_camera(self, message: CameraInfo) -> None:
-        try:
-            self._overlay.put_camera(
-                Intrinsics.create(
-                    message.width, message.height, message.k, message.d, message.distortion_model
-                )
+        self._overlay.put_camera(
+            Intrinsics.create(
+                message.width, message.height, message.k, message.d, message.distortion_model
             )
-        except CameraError as error:
-            self.get_logger().warning(str(error), throttle_duration_sec=10.0)
+        )
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
@@ -235,12 +232,7 @@ class PageNode(Node):
         if not self._picture.due():
             return
         message = deserialize_message(data, Image)
-        try:
-            grey = ImageReader().to_grey(message)
-        except ImageError as error:
-            self.get_logger().warning(str(error), throttle_duration_sec=10.0)
-            return
-        self._picture.put(nanoseconds(message.header.stamp), grey)
+        self._picture.put(nanoseconds(message.header.stamp), ImageReader().to_grey(message))
 
     def _watch(self) -> None:
         """Draw with the planner's limb, take images while somebody looks, end with the server."""
