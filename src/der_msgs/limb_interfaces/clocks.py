@@ -97,14 +97,11 @@ class ClockWatch:
     def __init__(self, node: Node, answers: bool) -> None:
         self._name = node.get_fully_qualified_name()
         self._estimate = OffsetEstimate()
-        asked, told = topics.CLOCK_QUESTIONS, topics.CLOCK_ANSWERS
-        self._publisher = node.create_publisher(
-            ClockExchange, told if answers else asked, qos.CLOCKS
-        )
+        says, hears, hear = topics.CLOCK_QUESTIONS, topics.CLOCK_ANSWERS, self._take
         if answers:
-            node.create_subscription(ClockExchange, asked, self._answer, qos.CLOCKS)
-        else:
-            node.create_subscription(ClockExchange, told, self._take, qos.CLOCKS)
+            says, hears, hear = topics.CLOCK_ANSWERS, topics.CLOCK_QUESTIONS, self._answer
+        self._publisher = node.create_publisher(ClockExchange, says, qos.CLOCKS)
+        node.create_subscription(ClockExchange, hears, hear, qos.CLOCKS)
         self._answers = answers
 
     def _answer(self, message: ClockExchange) -> None:

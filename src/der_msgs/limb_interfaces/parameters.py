@@ -18,6 +18,8 @@ from rclpy.parameter import Parameter
 
 _OF_RCLPY = ("qos_overrides.", "start_type_description_service")
 """Beginnings of the names of parameters that rclpy declares itself."""
+_TAKEN = {str: (int, float), float: (int,)}
+"""Numbers that are taken where a text or a float is wanted."""
 Value = bool | int | float | str | list[float] | list[int] | list[str]
 
 
@@ -80,14 +82,11 @@ def _declared(node: Node, name: str, default: Value, descriptor: ParameterDescri
     try:
         return node.declare_parameter(name, default, descriptor).value
     except InvalidParameterTypeException:
-        if not isinstance(default, (str, float)):
-            raise
         given = node.declare_parameter(
             name, default, ParameterDescriptor(dynamic_typing=True)
         ).value
         node.undeclare_parameter(name)
-        whole = isinstance(given, int) and not isinstance(given, bool)
-        if not (whole or (isinstance(given, float) and isinstance(default, str))):
+        if type(given) not in _TAKEN.get(type(default), ()):
             raise
         meant = type(default)(given)
         return node.declare_parameter(name, meant, descriptor, ignore_override=True).value
