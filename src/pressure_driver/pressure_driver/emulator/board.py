@@ -224,14 +224,14 @@ class EmulatedBoard:
             self._expired = False
             if command.valid_for is not None:
                 hold = self.faults.hold
-                self._valid_until = None if hold else self._time + command.valid_for
+                self._valid_until = math.inf if hold else self._time + command.valid_for
         if self.faults.echoless and command.kind != "read":
             return b""
         return self.protocol.reply(command, self.reading())
 
     def _vent(self) -> None:
         self._target = np.full(self.pneumatics.chamber_count, self.pneumatics.atmosphere)
-        self._valid_until: float | None = None
+        self._valid_until = math.inf
         self._vented = True
         self._apply()
 
@@ -261,7 +261,7 @@ class EmulatedBoard:
             self._dead_for -= duration
             if self._dead_for <= 0.0:
                 self._unsaid = self.boot()
-        if self._valid_until is not None and self._time > self._valid_until:
+        if self._time > self._valid_until:
             self._vent()
             self._expired = True
             self._unsaid += self.protocol.expired()
