@@ -45,13 +45,10 @@ class Rig:
     Args:
         stack: ends the nodes.
         nodes: with the emulated board.
-        port: of the board.
         folder: of their logs.
     """
 
-    def __init__(
-        self, stack: contextlib.ExitStack, nodes: list[NodeSpec], port: str, folder: Path
-    ) -> None:
+    def __init__(self, stack: contextlib.ExitStack, nodes: list[NodeSpec], folder: Path) -> None:
         self.client = stack.enter_context(GraphClient("benchmark"))
         self.commands: list[ChamberPressures] = []
         self.states: list[PressureState] = []
@@ -60,18 +57,18 @@ class Rig:
         subscribe(PressureState, topics.PRESSURE_STATE, qos.STATES, self.states.append)
         self.graph = RunningGraph(self.client, Progress())
         stack.callback(self.graph.stop)
-        self.graph.start(nodes, port, folder, {})
+        self.graph.start(nodes, folder, {})
 
 
 Setpoints = dict[int, tuple[float, ...]]
 """Stamp [ns] -> differential pressures [Pa]."""
 
 
-def _nodes(case: str, port: str, folder: Path) -> list[NodeSpec]:
+def _nodes(case: str, folder: Path) -> list[NodeSpec]:
     driver = {"real_time_priority": 0} if case == "ordinary" else {}
     setup = GraphSetup(folder / "bag", {}, hardware=Hardware(driver, twin={}), planner={})
     # The first two are board and driver.
-    return setup.nodes(port)[: None if case == "graph" else 2]
+    return setup.nodes(str(folder / "board"))[: None if case == "graph" else 2]
 
 
 NODE = """
@@ -263,8 +260,7 @@ def _measure(case: str, seconds: float, presses: int = 0) -> Samples:
     play: Callable[[GraphClient, float], Setpoints] = play_plan if case == "graph" else _stream
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="der_limb_driver_")))
-        port = str(folder / "board")
-        rig = Rig(stack, _nodes(case, port, folder), port, folder)
+        rig = Rig(stack, _nodes(case, folder), folder)
         client = rig.client
         client.call("pressure_driver/arm")
         busy = 0 if case in ("quiet", "graph") else os.cpu_count() or 1

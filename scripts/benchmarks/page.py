@@ -84,13 +84,12 @@ class PageGraph(Rig):
     def __init__(self, folder: Path, stack: contextlib.ExitStack, **options: Any) -> None:
         self._folder, self._stack = folder, stack
         self._windows = 0
-        board = str(folder / "board")
         options = {"metadata": {}, "planner": {}, **options}
-        specs = GraphSetup(bag=folder / "bag", page=0, **options).nodes(board)
+        specs = GraphSetup(bag=folder / "bag", page=0, **options).nodes(str(folder / "board"))
         for spec in specs:
             if spec.executable == "page":  # a window whose picture is taken is silent meanwhile
                 spec.parameters["lease_period"] = 10.0
-        super().__init__(stack, specs, board, folder)
+        super().__init__(stack, specs, folder)
         self.url = f"{self.client.diagnostic_values('page')['url']}?token={PAGE_TOKEN}"
 
     def open_window(self) -> Any:

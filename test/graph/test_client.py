@@ -32,7 +32,7 @@ def test_a_driver_without_its_board_ends_with_the_port_and_the_remedy(graph):
 def test_a_second_graph_that_begins_meanwhile_is_named(graph, monkeypatch):
     with contextlib.ExitStack() as others:
 
-        def start(running, specs, port, logs, remap):
+        def start(running, specs, logs, remap):
             for _ in range(2):
                 others.enter_context(GraphClient("board_emulator", domain_id=graph.domain_id))
             graph.client.wait_for(

@@ -6,7 +6,6 @@ Beside the graphs of all runs, an experiment may have a page.
 from __future__ import annotations
 
 import contextlib
-import os
 import tempfile
 import threading
 import time
@@ -70,12 +69,11 @@ def running_graph(
     graph = RunningGraph(client, progress)
     client.subscribe(PressureState, topics.PRESSURE_STATE, qos.STATES)
     with tempfile.TemporaryDirectory(prefix="der_limb_") as folder:
-        port = board_line(setup.protocol, folder)
-        specs = setup.nodes(port)
+        specs = setup.nodes(board_line(setup.protocol, folder))
         client.spin(DISCOVERY)
         _refuse_second_graph(client, specs)
         try:
-            graph.start(specs, port, logs, setup.rig.remap)
+            graph.start(specs, logs, setup.rig.remap)
             # A graph that was not seen at once, or that began meanwhile, is known by now.
             _refuse_second_graph(client, specs, own=1)
             graph.bag = Path(client.call("recorder/start"))
@@ -127,8 +125,8 @@ class RunningGraph:
     bag: Path = Path()
     real_time_factor: float = float("nan")
 
-    def start(self, specs: list[NodeSpec], port: str, logs: Path, remap: dict[str, str]) -> None:
-        """Start every node and wait until all are ready; the emulated board is at ``port``."""
+    def start(self, specs: list[NodeSpec], logs: Path, remap: dict[str, str]) -> None:
+        """Start every node and wait until all are ready."""
         begin = time.monotonic()
         self.elsewhere = {spec.executable: spec.host for spec in specs if spec.host}
         specs = [spec for spec in specs if not spec.host]
@@ -138,10 +136,8 @@ class RunningGraph:
                 spec.package, spec.executable, spec.parameters, logs, remap
             )
             self.client.watch(self.processes.values())
-            if spec.executable == "board_emulator" and port.startswith("tcp:"):
+            if spec.executable == "board_emulator":  # a driver ends where there is no board
                 self.client.wait_ready([spec.executable])
-            elif spec.executable == "board_emulator":
-                self.client.wait_for(lambda: os.path.exists(port), 60.0, "the port of the board")
         self._wait_elsewhere()
         self.client.wait_ready(self.processes)
         self.progress.say(f"  ready after {time.monotonic() - begin:.1f} s")
