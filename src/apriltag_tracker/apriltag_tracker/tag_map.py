@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import yaml
@@ -17,6 +16,13 @@ from apriltag_tracker import family as families
 from apriltag_tracker.family import TAG36H11, Family
 from apriltag_tracker.pose.curve import Curve
 
+if TYPE_CHECKING:
+    from typing_extensions import Self  # `typing` has it from Python 3.11 on
+
+Lengths = tuple[float, ...]
+"""Of the segments [m]."""
+Stretches = tuple[tuple[float, float], ...]
+"""From and to in arc length [m]."""
 SCHEMA_VERSION = 1
 
 UNIT_CORNERS = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
@@ -75,8 +81,8 @@ class LimbGeometry(ABC):
         stiff: stretches that cannot bend, from and to in arc length [m].
     """
 
-    segment_lengths: tuple[float, ...]
-    stiff: tuple[tuple[float, float], ...] = field(default=(), kw_only=True)
+    segment_lengths: Lengths
+    stiff: Stretches = field(default=(), kw_only=True)
 
     @property
     def length(self) -> float:
@@ -87,6 +93,42 @@ class LimbGeometry(ABC):
     @abstractmethod
     def limb_names(self) -> dict[int, str]:
         """Names of what is on the limb, by id, in the order of the map."""
+
+    @classmethod
+    def from_yaml(cls, path: str | Path) -> Self:
+        """Read a map.
+
+        Raises:
+            MapError: the file is missing, is no YAML, or a key is missing or impossible.
+        """
+        try:
+            return cls.from_dict(yaml.safe_load(Path(path).read_text()))
+        except OSError as error:
+            raise MapError(f"cannot read the map {path}: {error.strerror}") from error
+        except yaml.YAMLError as error:
+            raise MapError(f"the map {path} is not YAML: {error}") from error
+        except MapError as error:
+            raise MapError(f"{path}: {error}") from error
+
+    @classmethod
+    def from_dict(cls, data: Any) -> Self:
+        """Build a map from the content of its file.
+
+        Raises:
+            MapError: a key is missing or impossible.
+        """
+        if not isinstance(data, dict) or data.get("schema") != SCHEMA_VERSION:
+            raise MapError(f"'schema: {SCHEMA_VERSION}' expected at the top of the map")
+        limb = section(data, "limb")
+        lengths = tuple(floats(limb.get("segment_lengths"), None, "limb.segment_lengths"))
+        if not lengths or min(lengths) <= 0.0:
+            raise MapError("limb.segment_lengths: a list of positive lengths in m expected")
+        return cls._read(data, lengths, _stiff(limb.get("stiff") or [], lengths))
+
+    @classmethod
+    @abstractmethod
+    def _read(cls, data: dict[str, Any], lengths: Lengths, stiff: Stretches) -> Self:
+        """Read what sits on a limb of known geometry and around it; raises `MapError`."""
 
 
 @dataclass(frozen=True)
@@ -126,61 +168,17 @@ class TagMap(LimbGeometry):
         return {tag.id: str(tag.id) for tag in self.limb}
 
     @classmethod
-    def from_yaml(cls, path: str | Path) -> TagMap:
-        """Read a tag map.
-
-        Raises:
-            MapError: the file is missing, is no YAML, or a key is missing or impossible.
-        """
-        return read_map(path, cls.from_dict)
-
-    @classmethod
-    def from_dict(cls, data: Any) -> TagMap:
-        """Build a tag map from the content of its file; raises `MapError`."""
-        if not isinstance(data, dict) or data.get("schema") != SCHEMA_VERSION:
-            raise MapError(f"'schema: {SCHEMA_VERSION}' expected at the top of a tag map")
+    def _read(cls, data: dict[str, Any], lengths: Lengths, stiff: Stretches) -> Self:
         try:
             family = families.named(data.get("family"))
         except ValueError as error:
             raise MapError(str(error)) from error
-        limb = section(data, "limb")
-        world = section(data, "world")
-        lengths, stiff = limb_geometry(limb)
-        total = sum(lengths)
-        limb_tags = tuple(_limb_tag(entry, total) for entry in limb.get("tags") or [])
+        limb, world = section(data, "limb"), section(data, "world")
+        limb_tags = tuple(_limb_tag(entry, sum(lengths)) for entry in limb.get("tags") or [])
         if not limb_tags:
             raise MapError("limb.tags is empty: at least one tag must be on the limb")
         world_tags = tuple(_world_tag(entry) for entry in world.get("tags") or [])
         return cls(lengths, limb_tags, world_tags, family, stiff=stiff)
-
-
-_Map = TypeVar("_Map")
-
-
-def read_map(path: str | Path, build: Callable[[Any], _Map]) -> _Map:
-    """Return what ``build`` makes of the content of a map's file.
-
-    Raises:
-        MapError: the file is missing, is no YAML, or a key is missing or impossible.
-    """
-    try:
-        return build(yaml.safe_load(Path(path).read_text()))
-    except OSError as error:
-        raise MapError(f"cannot read the map {path}: {error.strerror}") from error
-    except yaml.YAMLError as error:
-        raise MapError(f"the map {path} is not YAML: {error}") from error
-    except MapError as error:
-        raise MapError(f"{path}: {error}") from error
-
-
-def limb_geometry(
-    limb: dict[str, Any],
-) -> tuple[tuple[float, ...], tuple[tuple[float, float], ...]]:
-    """Read the segments' lengths and the stiff stretches [m] of a map; raises `MapError`."""
-    lengths = tuple(floats(limb.get("segment_lengths"), None, "limb.segment_lengths"))
-    if not lengths or min(lengths) <= 0.0:
-        raise MapError("limb.segment_lengths: a list of positive lengths in m expected")
-    return lengths, _stiff(limb.get("stiff") or [], lengths)
 
 
 def on_limb(
@@ -217,7 +215,7 @@ def number(value: Any, name: str) -> float:
     return float(value)
 
 
-def _stiff(value: Any, lengths: tuple[float, ...]) -> tuple[tuple[float, float], ...]:
+def _stiff(value: Any, lengths: Lengths) -> Stretches:
     result: list[tuple[float, float]] = []
     for entry in value if isinstance(value, list) else [value]:
         start, end = floats(entry, 2, "limb.stiff")

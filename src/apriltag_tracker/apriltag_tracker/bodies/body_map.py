@@ -3,24 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from apriltag_tracker.tag_map import (
+    Lengths,
     LimbGeometry,
     MapError,
+    Stretches,
     floats,
-    limb_geometry,
     on_limb,
-    read_map,
     section,
 )
 
-SCHEMA_VERSION = 1
+if TYPE_CHECKING:
+    from typing_extensions import Self  # `typing` has it from Python 3.11 on
+
 LENGTH_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 """[m] of each unit in which positions may come."""
 _KEYS = {"name", "place", "arc_length", "position", "height", "offset", "rotation"}
@@ -110,24 +111,7 @@ class BodyMap(LimbGeometry):
         return {place: body.name for place, body in enumerate(self.limb)}
 
     @classmethod
-    def from_yaml(cls, path: str | Path) -> BodyMap:
-        """Read a body map.
-
-        Raises:
-            MapError: the file is missing, is no YAML, or a key is missing or impossible.
-        """
-        return read_map(path, cls.from_dict)
-
-    @classmethod
-    def from_dict(cls, data: Any) -> BodyMap:
-        """Build a body map from the content of its file.
-
-        Raises:
-            MapError: a key is missing or impossible.
-        """
-        if not isinstance(data, dict) or data.get("schema") != SCHEMA_VERSION:
-            raise MapError(f"'schema: {SCHEMA_VERSION}' expected at the top of a body map")
-        lengths, stiff = limb_geometry(section(data, "limb"))
+    def _read(cls, data: dict[str, Any], lengths: Lengths, stiff: Stretches) -> Self:
         unit = str(data.get("length_unit", "m"))
         if unit not in LENGTH_UNITS:
             raise MapError(f"length_unit is '{unit}': choose {', '.join(LENGTH_UNITS)}")

@@ -5,8 +5,9 @@ The pose is averaged while nothing moves and watched for bumps; the noise is car
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import cv2
@@ -39,9 +40,9 @@ class _Seen:
         count: of pictures; older ones fade once it stays.
     """
 
-    corners: NDArray[np.float64]
-    noise: NDArray[np.float64]
-    count: int = 1
+    corners: NDArray[np.float64] = field(default_factory=lambda: np.zeros((4, 2)))
+    noise: NDArray[np.float64] = field(default_factory=lambda: np.zeros((8, 8)))
+    count: int = 0
 
     def add(self, tag: Tag) -> None:
         """Take one more picture."""
@@ -69,7 +70,7 @@ class WorldPose:
     def __init__(self, tags: TagMap, intrinsics: Intrinsics) -> None:
         self._places = {tag.id: tag.corners() for tag in tags.world}
         self._intrinsics = intrinsics
-        self._seen: dict[int, _Seen] = {}
+        self._seen: defaultdict[int, _Seen] = defaultdict(_Seen)
         self._frames = 0
         self._shifted = 0
         self.pose: CameraPose | None = None
@@ -90,11 +91,7 @@ class WorldPose:
             self._seen.clear()
             self._frames = self._shifted = 0
         for tag in known:
-            seen = self._seen.get(tag.id)
-            if seen is None:
-                self._seen[tag.id] = _Seen(tag.corners.copy(), tag.covariance.copy())
-            else:
-                seen.add(tag)
+            self._seen[tag.id].add(tag)
         if known and (self._frames < 10 or self._frames % _SOLVE_EVERY == 0):
             self._solve()
         if known:
