@@ -170,8 +170,7 @@ class TelemetryMonitor:
         """Forget the newest telemetry, as after a disconnect."""
         self.chamber_pressure: Sequence[float] = [math.nan] * self._protocol.chamber_count
         """(2M,) [Pa] absolute, as measured; NaN before the first reading."""
-        self._heard = False
-        self._read_at = 0.0
+        self._read_at = math.nan
         self._supply_at = -math.inf
         self._changed_at = 0.0
         self._over_count = 0
@@ -188,7 +187,7 @@ class TelemetryMonitor:
 
     def telemetry_age(self, now: float) -> float:
         """Return the age [s] of the newest chamber pressures; NaN before the first."""
-        return now - self._read_at if self._heard else math.nan
+        return now - self._read_at
 
     def describe_gauge(self) -> str:
         """Return the gauge pressures as text, in kPa."""
@@ -237,9 +236,9 @@ class TelemetryMonitor:
         if tuple(reading) != tuple(self.chamber_pressure):
             self._changed_at = now
         self.chamber_pressure = reading
-        if not self._heard:
+        if math.isnan(self._read_at):
             self.restart_following(now)
-        self._heard, self._read_at = True, now
+        self._read_at = now
         self._judge_pressures(now, resting)
 
     def _judge_pressures(self, now: float, resting: bool) -> None:
@@ -271,7 +270,7 @@ class TelemetryMonitor:
     def silence(self, now: float) -> str:
         """Return that the board is silent or speaks without being understood, or nothing."""
         age = self.telemetry_age(now)
-        if not self._heard:
+        if math.isnan(age):
             damaged = self._recent_lines(now)[1]
             if damaged < MOST_DAMAGED:
                 return "no telemetry from the board yet"
@@ -296,7 +295,7 @@ class TelemetryMonitor:
         """Say what is wrong with the telemetry, the pressures and the supply."""
         if silence := self.silence(now):
             # Other readings are old then: one cause, one reason.
-            yield Condition(silence, lasting=self._heard)
+            yield Condition(silence, lasting=not math.isnan(self._read_at))
             return
         if self._over_count >= SAMPLES_TO_TRIP:
             most = max(self.chamber_pressure)

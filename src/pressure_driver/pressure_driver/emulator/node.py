@@ -109,9 +109,7 @@ class BoardEmulator(Node):
         return Health("ok", "regulating", values)
 
     def _watch(self) -> None:
-        if self._runner.error is not None:
-            error = self._runner.error
-            self.fatal_error = f"the emulated board ended: {type(error).__name__}: {error}"
+        self.fatal_error = self._runner.error
 
     def close(self) -> None:
         """Remove the port."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from pressure_driver.emulator import BoardCommand, BoardProtocol, BoardReading
+from pressure_driver.following import Duration
 from pressure_driver.protocols import festo, pneudrive
 from pressure_driver.settings import EmulatorSettings
 
@@ -25,7 +26,7 @@ class Slot:
     def __init__(self) -> None:
         self.mode = 0
         self.state = TO_BE_CONFIGURED
-        self._started_at: float | None = None
+        self._starting = Duration()
 
     def tell(self, word: int) -> None:
         """Take over the first register of the slot."""
@@ -33,14 +34,13 @@ class Slot:
         if mode in (festo.ACKNOWLEDGE, festo.INACTIVE):
             self.mode, self.state = festo.INACTIVE, TO_BE_CONFIGURED
         elif (mode, control, self.mode) == (festo.REGULATE, festo.BOTH_VALVES, festo.INACTIVE):
-            self.mode, self.state, self._started_at = festo.REGULATE, NOT_READY, None
+            self.mode, self.state = festo.REGULATE, NOT_READY
 
     def look(self, time: float) -> None:
         """Go on with the start (time since boot [s])."""
-        if self.state == NOT_READY:
-            self._started_at = time if self._started_at is None else self._started_at
-            if time - self._started_at >= SLOT_START_TIME:
-                self.state = festo.RUNNING
+        self._starting.note(self.state == NOT_READY, time)
+        if self._starting.until(time) >= SLOT_START_TIME:
+            self.state = festo.RUNNING
 
 
 class FestoBoard(BoardProtocol):

@@ -276,7 +276,8 @@ class BoardRunner:
     ) -> None:
         self.board = board
         self.port = port
-        self.error: Exception | None = None
+        self.error = ""
+        """Why the board has ended, if it has."""
         self._on_air = on_air
         self._on_command = on_command
         self._priority = real_time_priority
@@ -307,7 +308,7 @@ class BoardRunner:
         try:
             self._loop()
         except Exception as error:
-            self.error = error
+            self.error = f"the emulated board ended: {type(error).__name__}: {error}"
 
     def _loop(self) -> None:
         now = time.time_ns()
