@@ -69,7 +69,7 @@ def call(monkeypatch, capsys, tmp_path):
             1,
             "is out of reach",
         ),
-        ("der_planner.commands.study", ["accuracy", "--out", "BUSY"], 2, "no folder"),
+        ("der_planner.commands.study", ["accuracy", "--out", "BUSY"], 1, "cannot write into"),
         ("benchmarks.command", ["rod", "--json", "BUSY"], 2, "no folder"),
     ],
 )

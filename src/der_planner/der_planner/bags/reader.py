@@ -96,10 +96,8 @@ class BagReader:
     def _open(self) -> Reader:
         try:
             return self._stack.enter_context(Reader(self.path))
-        except Exception as error:  # rosbags raises many kinds for what is not whole
-            if self.path.suffix == ".db3":
-                raise RecoverError(str(error)) from error
-        self.unfinished = True
+        except Exception:  # rosbags raises many kinds for what is not whole
+            self.unfinished = True
         folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="bag_")))
         recovered = recover_bag(self.path, folder / self.path.stem).folder
         return self._stack.enter_context(Reader(recovered))

@@ -14,9 +14,6 @@ from collections.abc import Callable
 from der_planner.bags.topics import TopicSpec
 from der_planner.bags.writer import BagWriteError, BagWriter
 
-QUEUE_BYTES = 256 << 20
-FLUSH_INTERVAL = 1.0
-
 
 class RecordingSession:
     """Writes messages into a `BagWriter` on a thread of its own, and flushes it every second.
@@ -40,8 +37,8 @@ class RecordingSession:
         self,
         writer: BagWriter,
         *,
-        flush_interval: float = FLUSH_INTERVAL,
-        queue_bytes: int = QUEUE_BYTES,
+        flush_interval: float = 1.0,
+        queue_bytes: int = 256 << 20,
         on_failure: Callable[[str], None] = lambda _: None,
     ) -> None:
         self.writer = writer

@@ -17,7 +17,6 @@ from pathlib import Path
 from der_planner.experiment.console import (
     OptionError,
     Progress,
-    check_folder,
     command_parser,
     interrupt_once,
     run_command,
@@ -89,7 +88,6 @@ def _play(given: argparse.Namespace) -> int:
     interrupt_once()
     study = Study.read(given.study)
     out = (given.out or Path("studies") / study.name).resolve()
-    check_folder(out)
     progress = Progress()
     settings = PlaySettings(out, given.scheduler, given.workers, given.limit, given.retry_failed)
     kept = conduct(study, settings, progress)
