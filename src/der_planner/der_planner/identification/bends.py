@@ -288,17 +288,14 @@ def predicted(free: FreeTerms, model: Model, log: Prepared, values: Array) -> Pr
     angles_by, tip_by = (np.empty((*part.shape, len(values))) for part in (angles, tip))
     if response.derivative is not None:
         change = _moments_change(limb, list(compress(limbs, driven)), log, angles)
-        change /= _gain(limb)[:, None] * _NUDGE * scale[driven]
+        gain = np.array([segment.moment_gain for segment in limb.segments])
+        change /= gain[:, None] * _NUDGE * scale[driven]
         tip_by[:, :, driven], angles_by[:, :, driven] = response.derivative.by_effective(change)
     for place in np.flatnonzero(np.logical_not(driven)):
         moved = follow(model.another(free.limb_with(values + _STEP * units[place])), log)
         tip_by[:, :, place] = (moved.tip - tip) / (_STEP * scale[place])
         angles_by[:, :, place] = (moved.bend_angles - angles) / (_STEP * scale[place])
     return Predicted(angles, tip, angles_by, tip_by)
-
-
-def _gain(limb: Limb) -> Array:
-    return np.array([segment.moment_gain for segment in limb.segments])
 
 
 def _same_body(limb: Limb, other: Limb) -> bool:
@@ -328,14 +325,8 @@ def _moments(limb: Limb, log: Prepared, angles: Array, along: Array) -> Array:
     Friction and creep act along another bend (K, M) [rad].
     """
     material = Material(limb)
-    taken = material.memory_pressures(log.log.time, along)
-    driving = _gain(limb) * material.without_memory(log.pressure, taken)
-    lengths = np.array([segment.length for segment in limb.segments])
-    rest, linear, cubic = np.array(
-        [[s.rest_curvature, s.bending_stiffness, s.cubic_stiffness] for s in limb.segments]
-    ).T
-    curvature = angles / lengths - rest
-    moments: Array = driving - linear * curvature - cubic * curvature**3
+    beside = material.driven_bend(log.log.time, log.pressure, angles, along)
+    moments: Array = material.resting_law.stiffness * beside
     return moments
 
 
@@ -358,7 +349,7 @@ class BendFit:
         more_rows: Callable[[Predicted], Rows] | None = None,
     ) -> None:
         self.free, self._model, self._logs, self._more_rows = free, model, logs, more_rows
-        self._last: tuple[bytes, list[Predicted] | None] = (b"", None)
+        self._last: tuple[bytes, list[Predicted]] = (b"", [])
         self._bends_on = [_bends_on(free.limb, log) for log in logs]
         self._shaken = [_shaken(free.limb, log) for log in logs]
         self.weigh(np.full((3, free.limb.segment_count), ANGLE_ERROR))
@@ -395,21 +386,22 @@ class BendFit:
                 break
         return values
 
-    def _predicted(self, values: Array) -> list[Predicted] | None:
-        """Return what is predicted along the logs, or None; the last one is kept."""
+    def _predicted(self, values: Array) -> list[Predicted]:
+        """Return what is predicted along the logs; the last one is kept.
+
+        Raises:
+            RuntimeError: the model cannot follow the logs.
+        """
         key = same_values(values, self.free.unknowns)
         if self._last[0] != key:
-            try:
-                found = [predicted(self.free, self._model, log, values) for log in self._logs]
-            except RuntimeError:  # also where arcs that buckle do not come to rest
-                self._last = (key, None)
-            else:
-                self._last = (key, found)
+            found = [predicted(self.free, self._model, log, values) for log in self._logs]
+            self._last = (key, found)
         return self._last[1]
 
     def _rows(self, values: Array) -> Rows | None:
-        found = self._predicted(values)
-        if found is None:
+        try:
+            found = self._predicted(values)
+        except RuntimeError:  # also where arcs that buckle do not come to rest
             return None
         errors, slopes, scale = [], [], np.sqrt(CORRELATION)
         masks = zip(self._logs, found, self._bends_on, self._shaken, strict=True)
@@ -436,18 +428,11 @@ class BendFit:
         Raises:
             RuntimeError: the model cannot follow the logs.
         """
-        key = same_values(values, self.free.unknowns)
-        found = self._last[1] if self._last[0] == key else None
-        if found is None:
-            model = self._model.another(self.free.limb_with(values))
-            angles = [follow(model, log).bend_angles for log in self._logs]
-        else:
-            angles = [part.angles for part in found]
-        pairs = zip(self._logs, angles, strict=True)
+        pairs = zip(self._logs, self._predicted(values), strict=True)
         return np.concatenate(
             [
-                np.where(log.usable[:, None], log.log.bend_angles - bent, np.nan)
-                for log, bent in pairs
+                np.where(log.usable[:, None], log.log.bend_angles - part.angles, np.nan)
+                for log, part in pairs
             ]
         )
 
@@ -498,10 +483,7 @@ class BendFit:
         """
         unknowns = self.free.unknowns
         columns, errors = [], []
-        found = self._predicted(values)
-        if found is None:
-            raise RuntimeError("the model cannot follow the logs")
-        for log, part in zip(self._logs, found, strict=True):
+        for log, part in zip(self._logs, self._predicted(values), strict=True):
             speed = np.gradient(part.angles, log.log.time, axis=0)
             slopes = part.angles_by[log.usable].reshape(-1, len(values)) * unknowns.scale
             columns.append(np.column_stack([-speed[log.usable].ravel(), slopes]))

@@ -231,7 +231,9 @@ class Material:
         result: Array = (moved - taken_by[..., 0]) / stiffer
         return result
 
-    def driven_bend(self, time: Array, differential: Array, bend: Array) -> Array:
+    def driven_bend(
+        self, time: Array, differential: Array, bend: Array, along: Array | None = None
+    ) -> Array:
         """Return what pressures, friction and creep bend (K, M) beside the elastic moment [rad].
 
         Where it is less the weight's share, the bend is that of a limb at rest.
@@ -239,10 +241,12 @@ class Material:
         Args:
             time: (K,) [s].
             differential: (K, M) in the chambers [Pa].
-            bend: (K, M) along which friction and creep act [rad].
+            bend: (K, M) of the limb [rad].
+            along: (K, M) bend along which friction and creep act [rad]; None: the same.
         """
         law, bent = self.resting_law, bend - self.resting_law.rest
-        effective = self.without_memory(differential, self.memory_pressures(time, bend))
+        taken = self.memory_pressures(time, bend if along is None else along)
+        effective = self.without_memory(differential, taken)
         beside: Array = law.gain * effective - bent - law.cubic * bent**3
         return beside
 
