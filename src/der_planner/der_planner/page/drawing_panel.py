@@ -17,7 +17,6 @@ from der_msgs.msg import MotionCommand
 from der_planner.arrays import Array
 from der_planner.page.commands import Load
 from der_planner.page.drawing import DrawingError, Preview, drawn_pixels
-from der_planner.page.forms import FormError
 from der_planner.page.server import Parts
 from der_planner.page.situation import centimetres
 
@@ -160,13 +159,8 @@ class DrawingPanel:
         self._run("show", preview)
 
     def command(self) -> MotionCommand:
-        """Return the command that plays the drawing with what it was previewed with.
-
-        Raises:
-            FormError: there is no drawing, or no preview yet.
-        """
-        if self._playable is None:
-            raise FormError("draw a line first, and wait for its preview")
+        """Return what plays the drawing, with what it was previewed with; only while `ready`."""
+        assert self._playable is not None
         return self._playable
 
     async def _on_load(self) -> None:

@@ -99,15 +99,12 @@ class PictureFeed:
         self._asked = self._clock()
         return self._newest is not None and self._number != after
 
-    def take(self, after: int, shown: int = 0) -> Encoded | None:
-        """Return the newest picture, None if it is number ``after``.
+    def take(self, shown: int = 0) -> Encoded:
+        """Return the newest picture, once `has_newer` has told that there is one.
 
         Args:
-            after: number of the one that is known.
             shown: width at which it is shown [px], which may make it smaller; 0: as it is.
         """
-        if not self.has_newer(after):
-            return None
         with self._lock:
             assert self._newest is not None
             stamp, grey = self._newest

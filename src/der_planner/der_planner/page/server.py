@@ -123,9 +123,7 @@ def _add_picture(app: FastAPI, parts: Parts) -> None:
             if not time.monotonic() - begun < min(wait, LONGEST_WAIT):
                 return Response(status_code=204)
             await asyncio.sleep(PICTURE_POLL)
-        encoded = await asyncio.to_thread(parts.picture.take, after, width)
-        if encoded is None:
-            return Response(status_code=204)
+        encoded = await asyncio.to_thread(parts.picture.take, width)
         drawn = parts.overlay.at(encoded.stamp, parts.situation.reference_at(encoded.stamp))
         drawn |= {"number": encoded.number, "size": encoded.size}
         drawn["waited"] = round(time.monotonic() - begun, 4)
