@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -166,11 +166,7 @@ def commented(text: str, sections: Mapping[str, Mapping[str, Parameter]]) -> str
         text: one mapping, whose values are numbers, lists or mappings of declared keys.
         sections: declared parameters by the top-level key that holds them; "" for the top level.
     """
-    return "".join(f"{line}\n" for line in _commented_lines(text, sections))
-
-
-def _commented_lines(text: str, sections: Mapping[str, Mapping[str, Parameter]]) -> Iterator[str]:
-    section = ""
+    section, lines = "", list[str]()
     for line in text.splitlines():
         match = re.match(r"([- ]*)(\w+):", line)
         declared = None
@@ -178,7 +174,8 @@ def _commented_lines(text: str, sections: Mapping[str, Mapping[str, Parameter]])
             if not match[1]:
                 section = match[2]
             declared = sections.get(section if match[1] else "", {}).get(match[2])
-        yield f"{line}  # [{declared.unit}] {declared.text}" if declared else line
+        lines.append(f"{line}  # [{declared.unit}] {declared.text}" if declared else line)
+    return "\n".join([*lines, ""])
 
 
 def field_names(kind: Any) -> set[str]:

@@ -203,26 +203,16 @@ class ArcModel(Model):
         return ArcState(self._check("angles", angles), self._check("rates", rates))
 
     def resting(self, effective: Array) -> ArcState:
-        """Return the arcs at rest under effective pressures (M,) [Pa] and their weight."""
-        angles = self.resting_angles(effective)
-        return ArcState(angles, np.zeros_like(angles))
-
-    def rest_slope(self, state: ArcState, _effective: Array) -> Array:
-        """Return ∂angles/∂effective (n, n) [rad/Pa] of arcs at rest."""
-        matrix = self.stiffness_matrix(state.angles)
-        return np.asarray(np.linalg.solve(matrix, np.diag(self.gain)))
-
-    def resting_angles(self, pressures: ArrayLike) -> Array:
-        """Return the bend angles (n,) [rad] at rest under effective pressures (n,) [Pa] and weight.
+        """Return the arcs at rest under effective pressures (M,) [Pa] and their weight.
 
         By Newton's method on G u + Q_gravity = K (q − q_rest), with steps of at most 0.3 rad along
         which the energy falls: beyond the load that buckles the straight limb, a bent one is found.
         """
-        drive = self.gain * self._check("pressures", pressures)
+        drive = self.gain * self._check("pressures", effective)
         still = np.zeros(self.segment_count)
         q: Array = self.free_angles + drive / self.stiffness
         if not self.arcs.gravity.any() and not self.cubic.any():
-            return q
+            return ArcState(q, still)
         for _ in range(_RESTING_STEPS):
             pull = self._inertia(q, still)[3] + drive - self.elastic_torque(q)
             values, vectors = np.linalg.eigh(self.stiffness_matrix(q))
@@ -231,7 +221,12 @@ class ArcModel(Model):
             q = q + step * min(1.0, 0.3 / max(float(np.abs(step).max()), 1e-12))
             if np.abs(step).max() < 1e-10:
                 break
-        return q
+        return ArcState(q, still)
+
+    def rest_slope(self, state: ArcState, _effective: Array) -> Array:
+        """Return ∂angles/∂effective (n, n) [rad/Pa] of arcs at rest."""
+        matrix = self.stiffness_matrix(state.angles)
+        return np.asarray(np.linalg.solve(matrix, np.diag(self.gain)))
 
     def inverse_dynamics(
         self, angles: ArrayLike, rates: ArrayLike, accelerations: ArrayLike

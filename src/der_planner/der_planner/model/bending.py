@@ -24,11 +24,10 @@ _SMALLEST_STEP = 1e-11
 """Change of the bend angles that ends the iteration [rad]."""
 
 
-def end_edges(rod: Rod) -> list[tuple[int, int]]:
-    """Return the nodes of the edge that has the heading of each segment's end."""
-    last = len(rod.rest_lengths)
-    ends = [min(first + count - 1, last - 1) for first, count in rod.segments]
-    return [(end, end + 1) for end in ends]
+def end_edges(rod: Rod) -> list[int]:
+    """Return the edge that has the heading of each segment's end, from the node of its number."""
+    last = len(rod.rest_lengths) - 1
+    return [min(first + count - 1, last) for first, count in rod.segments]
 
 
 def bend_angles(rod: Rod, q: Array) -> Array:
@@ -56,7 +55,7 @@ def angles_of_outputs(outputs: Array) -> Array:
 
 def bend_outputs(rod: Rod) -> list[int]:
     """Return the indices (4M) into q on which the bend angles depend, for `bend_change`."""
-    return [4 * node + axis for edge in end_edges(rod) for node in edge for axis in (0, 1)]
+    return [4 * edge + place for edge in end_edges(rod) for place in (0, 1, 4, 5)]
 
 
 def bend_change(rod: Rod, q: Array, moved: Array) -> Array:

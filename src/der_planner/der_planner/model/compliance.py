@@ -59,8 +59,8 @@ def compliance(model: RodModel, bend_angles: ArrayLike, places: ArrayLike) -> Co
     couple = rod.input_gain * rod.rest_lengths[first]
     pressed = slack[:, None] * bends * couple
     # A bend angle is the heading of the edge at a segment's end, less that before the segment.
-    ends = np.array([edge for edge, _ in end_edges(rod)])
-    before = (np.arange(len(joints)) <= ends[:, None]).astype(float)
+    ends = np.array(end_edges(rod))[:, None]
+    before = (np.arange(len(joints)) <= ends).astype(float)
     share = np.diff(before, axis=0, prepend=0.0)
     return Compliance(
         np.einsum("mj,pjf->pmf", share, turns),

@@ -141,9 +141,9 @@ class Backend(ABC):
     def public_state(self, q: Array, v: Array, base: Base, like: RodState) -> RodState:
         """Return the state at q, v with frames of the kernels, or as in `like` in a plane."""
 
-    @abstractmethod
     def carry_frames(self, base: RodState, q: Array, v: Array) -> RodState:
-        """Return a state at q whose frames are those of `base`, transported."""
+        """Return a state at q whose frames are those of `base`, transported where they turn."""
+        return RodState(q, v, base.directors, base.reference_twist)
 
     @abstractmethod
     def framed(self, state: RodState) -> tuple[Array, Any, Array]:

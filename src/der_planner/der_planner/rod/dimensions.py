@@ -62,10 +62,6 @@ class PlanarBackend(Backend):
         """Return the state at q, v with the frames of `like`."""
         return RodState(q, v, like.directors, like.reference_twist)
 
-    def carry_frames(self, base: RodState, q: Array, v: Array) -> RodState:
-        """Return a state at q with the frames of `base`."""
-        return RodState(q, v, base.directors, base.reference_twist)
-
     def framed(self, state: RodState) -> tuple[Array, PlanarSpace, Array]:
         """Return the unknowns of a state, a work space of it, and its edges."""
         x, space = self.unknowns(state.q), self.work_space()
