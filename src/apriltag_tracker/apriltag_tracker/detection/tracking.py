@@ -104,21 +104,16 @@ class TagTracker:
     def __init__(
         self,
         wanted: Collection[int],
-        detector: Detector | None = None,
+        detector: Detector,
         full_search_period: float = FULL_SEARCH_PERIOD,
     ) -> None:
         self._wanted = frozenset(wanted)
-        self._detector = detector or Detector()
+        self._detector = detector
         self._full_search_period = full_search_period
         self.counts = TrackingCounts()
         self._tracks: dict[int, Track] = {}
         self._postponed: dict[int, Tag] | None = None
         """What was found in the last image, if its full search was left for later."""
-        self._last_full = self._last_thorough = -np.inf
-
-    def reset(self) -> None:
-        """Forget all tracks: the next frame is searched in full."""
-        self._tracks.clear()
         self._last_full = self._last_thorough = -np.inf
 
     def track(self, gray: NDArray[np.uint8], stamp: float, search_later: bool = False) -> list[Tag]:
@@ -135,7 +130,8 @@ class TagTracker:
         """
         self._postponed = None
         if any(not 0.0 < stamp - track.stamp <= _LONGEST_GAP for track in self._tracks.values()):
-            self.reset()
+            self._tracks.clear()
+            self._last_full = self._last_thorough = -np.inf
         predicted = {tag: track.predict(stamp) for tag, track in self._tracks.items()}
         fresh = [tag for tag, track in self._tracks.items() if track.missed == 0]
         found: dict[int, Tag] = {}

@@ -260,7 +260,7 @@ class SyntheticCamera:
     def _draw_mounts(self) -> Mounts:
         """Draw where the limb's tags really sit."""
         scale = (self.errors.mounting, self.errors.mounting, self.errors.mounting_angle)
-        drawn = [self._random.standard_normal(3) * scale for _ in self.tags.limb]
+        drawn = self._random.standard_normal((len(self.tags.limb), 3)) * scale
         return Mounts(
             np.array([tag.arc_length for tag in self.tags.limb]),
             np.array([tag.height for tag in self.tags.limb]),
@@ -270,12 +270,10 @@ class SyntheticCamera:
 
     def _draw_world(self) -> NDArray[np.float64]:
         """Draw where the fixed tags really are, (n, 5) placements."""
-        result = np.empty((len(self.tags.world), PLACEMENT))
-        for placement, tag in zip(result, self.tags.world, strict=True):
-            shift = self._random.standard_normal(2) * self.errors.survey
-            x, y, z = tag.position
-            placement[:] = x + shift[0], y + shift[1], z, tag.yaw, tag.size
-        return result
+        placed = np.array([(*tag.position, tag.yaw, tag.size) for tag in self.tags.world])
+        placed = placed.reshape(-1, PLACEMENT)
+        placed[:, :2] += self._random.standard_normal((len(placed), 2)) * self.errors.survey
+        return placed
 
     def _make_background(
         self, world: NDArray[np.float64]
