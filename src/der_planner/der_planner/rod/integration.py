@@ -330,8 +330,7 @@ def find_equilibrium(backend: Backend, start: RodState, u: Array, load: Array) -
     index = 0
     while reached < 1.0:
         target = min(1.0, reached + part)
-        guess = state
-        trial, iterations, update = backend.solve_static(guess, target * u, target * load, solver)
+        trial, iterations, update = backend.solve_static(state, target * u, target * load, solver)
         spent += abs(iterations)
         if iterations > 0:
             state = trial

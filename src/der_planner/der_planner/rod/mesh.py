@@ -67,20 +67,17 @@ class Mesh:
     @property
     def mass_diagonal(self) -> Array:
         """(4N-1,) M."""
-        return interleave(self.swung_node_mass, self.edge_inertia)
+        return interleave(self.swung_node_mass[:, None], self.edge_inertia)
 
     @property
     def damping_diagonal(self) -> Array:
         """(4N-1,) D of the mass-proportional damping."""
-        return interleave(self.node_damping, self.edge_inertia * self.edge_damping)
+        return interleave(self.node_damping[:, None], self.edge_inertia * self.edge_damping)
 
     @property
     def weight(self) -> Array:
         """(4N-1,) gravity on the nodes [N]."""
-        result = np.zeros(4 * self.nodes - 1)
-        for axis in range(3):
-            result[axis::4] = self.node_mass * self.gravity[axis]
-        return result
+        return interleave(np.outer(self.node_mass, self.gravity), 0.0)
 
     @property
     def node_mass(self) -> Array:
@@ -105,12 +102,12 @@ def _on_nodes(of_edges: Array) -> Array:
     return total
 
 
-def interleave(of_nodes: Array, of_edges: Array) -> Array:
-    """Return (4N-1,) with values of nodes (N,) at positions and of edges (N-1,) at angles."""
-    result = np.zeros(4 * len(of_nodes) - 1)
-    for axis in range(3):
-        result[axis::4] = of_nodes
-    result[3::4] = of_edges
+def interleave(of_nodes: Array, of_edges: Array | float) -> Array:
+    """Return (4N-1,) with values of nodes (N, 3 or 1) at positions, of edges (N-1,) at angles."""
+    rows = np.zeros((len(of_nodes), 4))
+    rows[:, :3] = of_nodes
+    rows[:-1, 3] = of_edges
+    result: Array = rows.ravel()[:-1]
     return result
 
 

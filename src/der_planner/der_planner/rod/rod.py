@@ -28,6 +28,7 @@ from der_planner.rod.mesh import (
     by_step,
     check_segments,
     clamped_indices,
+    interleave,
     limb_mesh,
     masses_on_nodes,
     not_negative,
@@ -355,10 +356,7 @@ class Rod:
     def _load(self, forces: ArrayLike | None) -> Array:
         if forces is None:
             return self.external_force
-        load = self.external_force.copy()
-        given = array(forces, (self.nodes, 3), "forces")
-        for axis in range(3):
-            load[axis::4] += given[:, axis]
+        load = self.external_force + interleave(array(forces, (self.nodes, 3), "forces"), 0.0)
         self._check_plane(load, "forces")
         return load
 
