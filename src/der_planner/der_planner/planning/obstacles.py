@@ -214,13 +214,10 @@ class Obstacles:
             PlanningError: names what cannot be, and the remedy.
         """
         length = model.limb.length
-        sizes = {"limb_radius_m": self.limb_radius / length}
         for each in self.items:
-            sizes[str(each)] = abs(float(each.away(np.zeros(2))[0])) / (_FAR * length)
-        for name, size in sizes.items():
-            if size > 1.0:
+            if abs(each.away(np.zeros(2))[0]) > _FAR * length:
                 raise PlanningError(
-                    f"{name} in the file of obstacles is far too large for a limb of {length:.3g} "
+                    f"{each} in the file of obstacles is far too large for a limb of {length:.3g} "
                     "m: give all lengths in metres"
                 )
         try:
