@@ -45,6 +45,7 @@ from der_planner.experiment.console import (
     run_command,
 )
 from der_planner.experiment.processes import GraphError, Hardware, NodeError
+from der_planner.files import write_whole
 from der_planner.identification import (
     CalibrationLog,
     FitReport,
@@ -122,8 +123,7 @@ def _main(given: argparse.Namespace) -> int:
     kept.to_yaml(given.out)
     print(f"limb file: {given.out}")
     if given.report:
-        given.report.mkdir(parents=True, exist_ok=True)
-        (given.report / "report.txt").write_text(text + "\n")
+        write_whole(given.report / "report.txt", text + "\n")
         plot_prediction(limb, log, given.report / "prediction.png", *unseen[:1])
         print(f"report: {given.report}")
     return 0

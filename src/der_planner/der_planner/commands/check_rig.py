@@ -38,6 +38,7 @@ from der_planner.experiment.console import (
     run_command,
 )
 from der_planner.experiment.processes import GraphError, Hardware, NodeError
+from der_planner.files import write_whole
 from der_planner.identification.excitation import within_limits
 from der_planner.identification.rig import GENTLE, RigError, RigFinding, RigLog, check_run, find_rig
 from der_planner.limb import Limb
@@ -118,11 +119,10 @@ def _main(given: argparse.Namespace) -> int:
     if given.out is not None:
         content["driver"] = {**(content.get("driver") or {}), "wiring": wiring}
         content["found"] = lines
-        given.out.parent.mkdir(parents=True, exist_ok=True)
         if clamp is not None and is_off(clamp):
             _move_base(content, map_path, clamp, given.out)
         text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
-        given.out.write_text(text, encoding="utf-8")
+        write_whole(given.out, text)
         print(f"rig file: {given.out}")
     return 0
 
@@ -132,7 +132,7 @@ def _move_base(content: dict[str, Any], map_path: Path, clamp: Clamp, out: Path)
     node, parameter = ("poses", "body_map") if "poses" in content else ("tracker", "tag_map")
     moved = out.with_suffix(f".{parameter}.yaml").resolve()
     written = at_clamp(yaml.safe_load(map_path.read_text()), clamp)
-    moved.write_text(yaml.safe_dump(written, sort_keys=False))
+    write_whole(moved, yaml.safe_dump(written, sort_keys=False))
     parameters = content.get(node) or {}
     if "host" in parameters:
         print(f"map with limb_base at the clamp, for {parameters['host']}: {moved}")

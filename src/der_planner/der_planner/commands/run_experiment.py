@@ -120,7 +120,6 @@ def run(options: Options, progress: Progress | None = None) -> None:
     if options.dry_run:
         _describe(options, trials, left, limb, progress)
         return
-    options.out.mkdir(parents=True, exist_ok=True)
     progress.say(
         f"{len(left)} of {len(trials)} trials to play on {_stage(options)}, into {options.out}"
     )

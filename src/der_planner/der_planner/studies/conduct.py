@@ -125,13 +125,14 @@ class Store:
     def __init__(self, folder: Path, study: Study) -> None:
         self.folder, self._study = folder, study
         self._rows = folder / "rows.jsonl"
-        with self._written():
+        with self.written():
             folder.mkdir(parents=True, exist_ok=True)
             (folder / "study.yaml").write_text(study.text, encoding="utf-8")
             self._rows.touch()
 
     @contextlib.contextmanager
-    def _written(self) -> Iterator[None]:
+    def written(self) -> Iterator[None]:
+        """Say what helps where the folder cannot be written."""
         try:
             yield
         except OSError as error:
@@ -150,7 +151,7 @@ class Store:
         results = {name: outcome.results.get(name) for name in self._study.keep}
         ended = {"error": outcome.error or None, "sources": outcome.sources}
         line = json.dumps({"key": row.key, **row.values, **results, **ended}, allow_nan=False)
-        with self._written(), self._rows.open("a", encoding="utf-8") as file:
+        with self.written(), self._rows.open("a", encoding="utf-8") as file:
             file.write(f"\n{line}")  # the line break comes first: it ends a line that was cut off
 
     def load(self) -> dict[str, Kept]:
@@ -170,7 +171,7 @@ class Store:
     def write_table(self, kept: Mapping[str, Kept]) -> None:
         """Write all rows as one table, ``rows.csv``, in the order of the study."""
         columns = ["key", *self._study.factors, *self._study.keep, "error", "sources"]
-        with self._written(), (self.folder / "rows.csv").open("w", newline="") as file:
+        with self.written(), (self.folder / "rows.csv").open("w", newline="") as file:
             table = csv.DictWriter(file, columns, extrasaction="ignore")
             table.writeheader()
             table.writerows(kept.values())

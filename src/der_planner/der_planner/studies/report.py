@@ -16,11 +16,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from der_planner.arrays import Array
+from der_planner.files import write_whole
 from der_planner.results import figures as style
 from der_planner.results.report import document, figure, section
 from der_planner.results.tables import Table
 from der_planner.studies.conduct import Kept, Store
-from der_planner.studies.factors import StudyError
 from der_planner.studies.study import Study
 
 Records = Sequence[Kept]
@@ -49,14 +49,9 @@ def summarise(study: Study, kept: Mapping[str, Kept], store: Store) -> Path:
         StudyError: the folder cannot be written.
     """
     store.write_table(kept)
-    folder = store.folder / "report"
-    try:
-        folder.mkdir(exist_ok=True)
-        pictures = draw_all(study, kept, folder)
-        page = folder / "report.html"
-        page.write_text(_page(study, kept, pictures), encoding="utf-8")
-    except OSError as error:
-        raise StudyError(f"cannot write into {folder}: {error.strerror}") from error
+    page = store.folder / "report" / "report.html"
+    with store.written():
+        write_whole(page, _page(study, kept, draw_all(study, kept, page.parent)))
     return page
 
 
