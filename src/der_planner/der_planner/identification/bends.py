@@ -15,7 +15,7 @@ import math
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from itertools import compress
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,9 +34,7 @@ from der_planner.identification.log import Prepared
 from der_planner.limb import Limb, Segment, Term, declarations
 from der_planner.model import CONTROL_PERIOD, Material, Model, Response, simulate
 
-if TYPE_CHECKING:
-    from typing_extensions import Self  # `typing` has it from Python 3.11 on
-
+AnyTerms = TypeVar("AnyTerms", bound="FreeTerms")
 GROUPS = ("asymmetry", "stiffening", "cubic", "coupling", "friction", "creep", "dynamics")
 """Model terms that may be left out, in the order in which they are explained."""
 OPTIONAL = ("mass",)
@@ -113,7 +111,9 @@ class FreeTerms:
     terms: tuple[Term, ...]
 
     @classmethod
-    def of(cls, limb: Limb, names: Collection[str], values: Array | None = None) -> Self:
+    def of(
+        cls: type[AnyTerms], limb: Limb, names: Collection[str], values: Array | None = None
+    ) -> AnyTerms:
         """Return the terms of these names in all segments that have them.
 
         Args:
@@ -138,12 +138,12 @@ class FreeTerms:
         known = [(term.spread, term.low, term.high, term.scale) for term in self.terms]
         return Unknowns(self.at_places(self.values), *np.reshape(known, (-1, 4)).T)
 
-    def only(self, chosen: NDArray[np.bool_]) -> Self:
+    def only(self, chosen: NDArray[np.bool_]) -> FreeTerms:
         """Return those of the terms that are chosen (P,)."""
         places, terms = compress(self.places, chosen), compress(self.terms, chosen)
         return replace(self, places=tuple(places), terms=tuple(terms))
 
-    def told(self, name: str, value: Array, deviation: Array) -> Self:
+    def told(self, name: str, value: Array, deviation: Array) -> FreeTerms:
         """Return the terms where something else than the log has measured one of each segment.
 
         Args:

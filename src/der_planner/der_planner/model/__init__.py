@@ -5,7 +5,7 @@
 
 from der_planner.model.arcs import ArcModel
 from der_planner.model.material import Material
-from der_planner.model.model import NODES, Model, State
+from der_planner.model.model import NODES, AnyModel, Model, State
 from der_planner.model.rod import RodModel
 from der_planner.model.simulation import CONTROL_PERIOD, STEPS, Initial, Response, simulate
 
@@ -13,6 +13,7 @@ __all__ = [
     "CONTROL_PERIOD",
     "NODES",
     "STEPS",
+    "AnyModel",
     "ArcModel",
     "Initial",
     "Material",

@@ -10,7 +10,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol
+from typing import Any, ClassVar, Literal, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,9 +22,7 @@ from der_planner.model.bending import Kinematics
 from der_planner.model.material import Material
 from der_planner.rod import RodState
 
-if TYPE_CHECKING:
-    from typing_extensions import Self  # `typing` has it from Python 3.11 on
-
+AnyModel = TypeVar("AnyModel", bound="Model")
 Outputs = Literal["", "tip", "all"]
 """What a linearisation keeps the derivatives of: nothing, the tip, or tip and bend angles."""
 
@@ -121,7 +119,7 @@ class Model(ABC):
         seen = limb.for_model(name)
         return Model.kinds[name](seen, nodes)
 
-    def another(self, limb: Limb) -> Self:
+    def another(self: AnyModel, limb: Limb) -> AnyModel:
         """Return the same model of another limb."""
         return type(self)(limb.for_model(self.name), self.nodes)
 

@@ -18,7 +18,6 @@ import copy
 import dataclasses
 import math
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.interpolate import BSpline, make_interp_spline
@@ -44,9 +43,6 @@ from der_planner.planning.workspace import (
     Workspace,
 )
 from der_planner.rod import ConvergenceError, Rod, RodState
-
-if TYPE_CHECKING:
-    from typing_extensions import Self  # `typing` has it from Python 3.11 on
 
 METHODS = {"der": ("paper", "projected", "optimal"), "pcc": ("paper", "projected", "optimal")}
 """The methods of each model. Arcs have one unknown a pressure: their two balances are the same."""
@@ -85,7 +81,7 @@ class Configuration(ABC):
         """Return the bend angles (…, M) [rad] at instants (…,) [s]."""
         return sample_spline(self.bend, time)[0]
 
-    def on(self, model: Model) -> Self:
+    def on(self, model: Model) -> Configuration:
         """Return the same motion for the model of another limb with as many segments."""
         other = copy.copy(self)
         other.model = model

@@ -8,16 +8,13 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 
 from der_planner.arrays import Array
 from der_planner.limb import PAYLOAD, Limb
-from der_planner.model import Model, RodModel
+from der_planner.model import AnyModel, RodModel
 from der_planner.rod import ConvergenceError, Rod, RodState
-
-AnyModel = TypeVar("AnyModel", bound=Model)
 
 NEAR = 1.1
 """A standing limb that would buckle under less than this multiple of its load is near that [-]."""
