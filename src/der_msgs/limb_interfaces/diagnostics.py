@@ -20,6 +20,8 @@ from limb_interfaces.clocks import ClockWatch
 
 ENDED_IN_ORDER = "ended in order"
 """What a node says last, unless something ended it: its silence is then no alarm."""
+TOUCHED = "something touched the limb"
+"""How the planner begins to say why a plan has ended, where it had the limb vented for that."""
 
 
 @dataclass

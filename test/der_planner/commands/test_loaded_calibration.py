@@ -1,14 +1,17 @@
 """The commands on tables of a limb that hangs and carries something."""
 
+import argparse
 import re
 import sys
 
+import numpy as np
 import pytest
 from link_chain import LinkChain
 from log_table import write_csv
 
 from der_planner.commands import calibrate_limb, check_limb
-from der_planner.identification.excitation import waves
+from der_planner.identification.excitation import PERIOD, waves
+from der_planner.identification.stiffness import HELD, LEAST_REST
 from der_planner.limb import Limb, gravity_of
 
 pytestmark = pytest.mark.slow
@@ -93,3 +96,12 @@ def test_loads_that_cannot_be_are_refused(table, monkeypatch, capsys):
     ):
         assert run(calibrate_limb, *given, *wrong, monkeypatch=monkeypatch) != 0
         assert reason in capsys.readouterr().err
+
+
+def test_a_run_says_in_its_rest_when_to_hang_the_weight_on():
+    given = argparse.Namespace(play=None, quick=True, weight=0.05, at=0.2)
+    played = calibrate_limb._excitation(Limb.default(), 20_000.0, given)
+    ((index, said),) = played.prompts.items()
+    assert "hang 0.05 kg on at 0.2 m" in said
+    pressed = np.flatnonzero(played.differential_pressure.any(axis=1))[-1]
+    assert HELD < (index - pressed) * PERIOD < played.duration - pressed * PERIOD - LEAST_REST

@@ -13,9 +13,9 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import Log
 from waiting import Clock, wait_for
 
-from der_msgs.msg import PressureState
+from der_msgs.msg import LimbContact, PressureState
 from der_planner.page.situation import DEAD, FRESH, Situation, as_typed
-from limb_interfaces.diagnostics import ENDED_IN_ORDER
+from limb_interfaces.diagnostics import ENDED_IN_ORDER, TOUCHED
 
 
 def state(mode: int, measured: float = 0.0, **fields: Any) -> PressureState:
@@ -102,6 +102,26 @@ def test_a_fault_and_a_lost_operator_are_told(situation: Situation) -> None:
     (alarm,) = alarms(situation)
     assert (alarm["level"], alarm["advice"]) == ("notice", "arm to go on")
     situation.put_status(status("/limb/pressure_driver", lost_operator="none"))
+    assert alarms(situation) == []
+
+
+def test_a_touch_is_told_and_a_limb_that_was_vented_for_it(
+    situation: Situation, clock: Clock
+) -> None:
+    situation.put_driver(state(PressureState.TRACKING, 9_000.0))
+    situation.put_contact(LimbContact(touched=True, said="0.30 N, at 17.0 cm"))
+    (alarm,) = alarms(situation)
+    assert (alarm["level"], alarm["text"]) == (
+        "notice",
+        "Something touches the limb: 0.30 N, at 17.0 cm",
+    )
+    clock.now += FRESH["contact"] + 0.1
+    situation.put_driver(state(PressureState.DISARMED))
+    reason = f"{TOUCHED} (the reaction is to vent): 0.30 N, at 17.0 cm; the driver vents"
+    situation.put_status(status("/limb/planner", state="vented", reason=reason))
+    (alarm,) = alarms(situation)
+    assert (alarm["level"], alarm["text"]) == ("danger", f"The limb was vented: {reason}")
+    situation.put_driver(state(PressureState.ARMED))
     assert alarms(situation) == []
 
 

@@ -59,6 +59,7 @@ from der_planner.identification import (
 from der_planner.identification.bends import GROUPS
 from der_planner.identification.excitation import (
     AMPLITUDE,
+    PERIOD,
     Excitation,
     calibration_run,
     read_excitation,
@@ -292,12 +293,10 @@ def _excitation(prior: Limb, pressure_limit: float, given: argparse.Namespace) -
     run = calibration_run(AMPLITUDE * pressure_limit, prior.segment_count, given.quick)
     if given.weight is None:
         return run
-    print(
-        f"after {run.duration + FREE:.0f} s, hang {given.weight:g} kg on at {given.at:g} m for "
-        f"ten seconds or more; the run ends after {run.duration + REST:.0f} s",
-        file=sys.stderr,
-    )
-    return run.with_rest(REST)
+    at, said = run.duration + FREE, f"hang {given.weight:g} kg on at {given.at:g} m"
+    print(f"be ready to {said} after {at:.0f} s, when you are told to", file=sys.stderr)
+    now = f"  NOW {said}, and leave it there until the run ends in {REST - FREE:.0f} s"
+    return dataclasses.replace(run.with_rest(REST), prompts={round(at / PERIOD): now})
 
 
 def _obtain(prior: Limb, given: argparse.Namespace) -> CalibrationLog:

@@ -236,6 +236,8 @@ def play_calibration(
                     values = excitation.differential_pressure[sent]
                     setpoint.differential_pressure = values.tolist()
                     publisher.publish(setpoint)
+                    if sent in excitation.prompts:
+                        progress.say(excitation.prompts[sent])
                     sent += 1
 
             graph.play(first / stamps.NANOSECONDS, float(excitation.time[-1]), send_due)

@@ -5,7 +5,8 @@ The run holds stairs, slow waves, steps and a band-limited sweep.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -38,11 +39,13 @@ class Excitation:
         time: (K,) [s].
         differential_pressure: (K, M) [Pa].
         name: of what it is for; the plan's id begins with it.
+        prompts: what an operator is to do, by the index of the setpoint with which it is said.
     """
 
     time: Array
     differential_pressure: Array
     name: str = "calibration"
+    prompts: Mapping[int, str] = field(default_factory=dict)
 
     @property
     def duration(self) -> float:

@@ -26,6 +26,7 @@ from der_planner.nodes.planner_topics import PlannerPublishers
 from der_planner.planning import METHODS, Motion, plan
 from der_planner.planning.streaming import GRID, Schedule
 from limb_interfaces.clocks import LARGEST
+from limb_interfaces.diagnostics import TOUCHED
 from limb_interfaces.stamps import NANOSECONDS, nanoseconds
 
 _TRAVEL = 0.015
@@ -174,7 +175,7 @@ class Corrector:
                 said = "the motion has ended: touch is felt in motions with feedback alone"
                 self._output.contact(schedule, replace(over, said=said))
             if each.vented:
-                return f"something touched the limb (the reaction is to vent): {touch.said}"
+                return f"{TOUCHED} (the reaction is to vent): {touch.said}"
         return ""
 
     def pressures(self, schedule: Schedule, index: int) -> Array:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
+from limb_interfaces.diagnostics import TOUCHED
+
 SUPPLY = "close the valve at the air supply"
 """What is left where no program can vent the limb."""
 PRESSED = 1.0
@@ -85,7 +87,7 @@ def alarms(snapshot: dict[str, Any]) -> list[Alarm]:
         snapshot: `Situation.snapshot`, with nodes and sources.
     """
     own = {node["own"]: node for node in snapshot["nodes"] if node["own"]}
-    found = list(_of_nodes(own))
+    found = [*_of_touch(snapshot, own.get("planner")), *_of_nodes(own)]
     if not _between_runs(own):
         found[:0] = _of_driver(snapshot, own.get(DRIVER))
     return sorted(found, key=lambda alarm: alarm.level != "danger")
@@ -150,6 +152,17 @@ def start_of(name: str, node: dict[str, Any] | None) -> str:
     package = "apriltag_tracker" if name in TRACKERS else "der_planner"
     package = DRIVER if name == DRIVER else package
     return known or f"scripts/ros2 run {package} {name}"
+
+
+def _of_touch(snapshot: dict[str, Any], planner: dict[str, Any] | None) -> Iterator[Alarm]:
+    """Yield what touches the limb, or that the limb was vented for it."""
+    contact, driver = snapshot["contact"], snapshot["driver"]
+    reason = planner["values"].get("reason", "") if planner is not None else ""
+    if contact is not None and contact["touched"] and snapshot["sources"]["contact"]["fresh"]:
+        told = f"Something touches the limb: {contact['said']}"
+        yield Alarm("notice", told, None, "look at the limb, and vent it where that must not be")
+    elif reason.startswith(TOUCHED) and driver is not None and driver["mode"] == "disarmed":
+        yield Alarm("danger", f"The limb was vented: {reason}", None, "free the limb, then arm")
 
 
 def _of_nodes(own: dict[str, dict[str, Any]]) -> Iterator[Alarm]:

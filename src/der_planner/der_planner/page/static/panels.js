@@ -11,7 +11,6 @@
     put(find("missing-line"), missing);
     if (data.driver) showSupply(data.driver);
     showEstimate(data.estimate);
-    showContact(data.contact);
   });
 
   function showNodes(nodes, waited) {
@@ -70,13 +69,6 @@
     const supply = driver.supply_kpa === null ? "unknown" : `${driver.supply_kpa.toFixed(1)} kPa`;
     const heard = driver.telemetry_age === null ? "never" : `${driver.telemetry_age.toFixed(2)} s ago`;
     put(find("supply"), `Supply ${supply} absolute · board heard ${heard}`);
-  }
-
-  function showContact(contact) {
-    const line = find("contact-line");
-    if (!line) return;
-    line.hidden = !contact?.touched || page.isOld("contact");
-    if (!line.hidden) put(line, `Something touches the limb: ${contact.said}`);
   }
 
   // What feedback knows beside the shape is shown only while it speaks.
