@@ -10,9 +10,10 @@ from link_chain import LinkChain
 from log_table import write_csv
 
 from der_planner.commands import calibrate_limb, check_limb
-from der_planner.identification.excitation import PERIOD, waves
+from der_planner.identification.excitation import waves
 from der_planner.identification.stiffness import HELD, LEAST_REST
 from der_planner.limb import Limb, gravity_of
+from der_planner.model import CONTROL_PERIOD
 
 pytestmark = pytest.mark.slow
 
@@ -104,4 +105,8 @@ def test_a_run_says_in_its_rest_when_to_hang_the_weight_on():
     ((index, said),) = played.prompts.items()
     assert "hang 0.05 kg on at 0.2 m" in said
     pressed = np.flatnonzero(played.differential_pressure.any(axis=1))[-1]
-    assert HELD < (index - pressed) * PERIOD < played.duration - pressed * PERIOD - LEAST_REST
+    assert (
+        HELD
+        < (index - pressed) * CONTROL_PERIOD
+        < played.duration - pressed * CONTROL_PERIOD - LEAST_REST
+    )

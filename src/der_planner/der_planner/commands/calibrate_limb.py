@@ -59,7 +59,6 @@ from der_planner.identification import (
 from der_planner.identification.bends import GROUPS
 from der_planner.identification.excitation import (
     AMPLITUDE,
-    PERIOD,
     Excitation,
     calibration_run,
     read_excitation,
@@ -72,6 +71,7 @@ from der_planner.identification.readers import is_ours, read_table
 from der_planner.identification.report import plot_prediction
 from der_planner.identification.stiffness import FREE, REST
 from der_planner.limb import Limb, LimbError
+from der_planner.model import CONTROL_PERIOD
 from der_planner.planning.loads import nearly_buckling
 from pressure_driver.settings import Settings
 
@@ -296,7 +296,7 @@ def _excitation(prior: Limb, pressure_limit: float, given: argparse.Namespace) -
     at, said = run.duration + FREE, f"hang {given.weight:g} kg on at {given.at:g} m"
     print(f"be ready to {said} after {at:.0f} s, when you are told to", file=sys.stderr)
     now = f"  NOW {said}, and leave it there until the run ends in {REST - FREE:.0f} s"
-    return dataclasses.replace(run.with_rest(REST), prompts={round(at / PERIOD): now})
+    return dataclasses.replace(run.with_rest(REST), prompts={round(at / CONTROL_PERIOD): now})
 
 
 def _obtain(prior: Limb, given: argparse.Namespace) -> CalibrationLog:
