@@ -105,8 +105,5 @@ def test_a_run_says_in_its_rest_when_to_hang_the_weight_on():
     ((index, said),) = played.prompts.items()
     assert "hang 0.05 kg on at 0.2 m" in said
     pressed = np.flatnonzero(played.differential_pressure.any(axis=1))[-1]
-    assert (
-        HELD
-        < (index - pressed) * CONTROL_PERIOD
-        < played.duration - pressed * CONTROL_PERIOD - LEAST_REST
-    )
+    rested = CONTROL_PERIOD * (index - pressed)
+    assert HELD < rested < played.duration - CONTROL_PERIOD * pressed - LEAST_REST
