@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from der_planner.identification import CalibrationLog, FitReport, fit, predict, record_twin
-from der_planner.identification.bends import GROUPS
 from der_planner.identification.excitation import PERIOD, Excitation, calibration_run
+from der_planner.identification.terms import GROUPS
 from der_planner.limb import Limb
 
 Figures = dict[str, float | str]

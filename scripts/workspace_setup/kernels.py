@@ -17,8 +17,9 @@ from apriltag_tracker.synthetic.camera import CameraModel, SyntheticCamera
 from apriltag_tracker.synthetic.shapes import constant_curvature
 from apriltag_tracker.tag_map import TagMap
 from der_planner.identification import CalibrationLog
-from der_planner.identification.bends import NODES, FreeTerms, predicted
+from der_planner.identification.bends import NODES, predicted
 from der_planner.identification.log import Prepared
+from der_planner.identification.terms import FreeTerms
 from der_planner.limb import Limb
 from der_planner.model import CONTROL_PERIOD, RodModel, simulate
 from der_planner.planning import METHODS, Motion, plan

@@ -7,18 +7,11 @@ import pytest
 from limbs import with_segments
 
 from der_planner.identification import CalibrationLog, LogError, check, fit, predict
-from der_planner.identification.bends import (
-    COLUMN,
-    NODES,
-    TERMS,
-    FreeTerms,
-    follow,
-    predicted,
-    values_of,
-)
+from der_planner.identification.bends import NODES, follow, predicted
 from der_planner.identification.excitation import calibration_run, steps, sweep, waves
 from der_planner.identification.lengths import fit_geometry, lengths_of, with_lengths
 from der_planner.identification.log import Prepared
+from der_planner.identification.terms import COLUMN, TERMS, FreeTerms, values_of
 from der_planner.limb import Limb
 from der_planner.model import Material, RodModel
 

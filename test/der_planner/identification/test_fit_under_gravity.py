@@ -10,7 +10,7 @@ from limbs import with_segments
 from link_chain import LinkChain
 
 from der_planner.identification import CalibrationLog, LogError, fit, predict
-from der_planner.identification.bends import NODES, FreeTerms, predicted
+from der_planner.identification.bends import NODES, predicted
 from der_planner.identification.excitation import sweep, waves
 from der_planner.identification.lengths import (
     GivesWayError,
@@ -20,6 +20,7 @@ from der_planner.identification.lengths import (
     with_lengths,
 )
 from der_planner.identification.log import Prepared
+from der_planner.identification.terms import FreeTerms
 from der_planner.limb import Limb, PointMass, gravity_of
 from der_planner.model import RodModel, simulate
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import yaml
 
-from der_planner.identification.bends import COLUMN, TERMS, to_limb, values_of
+from der_planner.identification.terms import COLUMN, TERMS, to_limb, values_of
 from der_planner.limb import (
     DEFAULT_LIMB_FILE,
     CalibratedRange,

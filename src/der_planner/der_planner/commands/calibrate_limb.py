@@ -56,7 +56,6 @@ from der_planner.identification import (
     read_log,
     record_twin,
 )
-from der_planner.identification.bends import GROUPS
 from der_planner.identification.excitation import (
     AMPLITUDE,
     Excitation,
@@ -70,6 +69,7 @@ from der_planner.identification.log import prepare
 from der_planner.identification.readers import is_ours, read_table
 from der_planner.identification.report import plot_prediction
 from der_planner.identification.stiffness import FREE, REST
+from der_planner.identification.terms import GROUPS
 from der_planner.limb import Limb, LimbError
 from der_planner.model import CONTROL_PERIOD
 from der_planner.planning.loads import nearly_buckling

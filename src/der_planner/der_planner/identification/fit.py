@@ -11,18 +11,7 @@ import numpy as np
 
 from der_planner.arrays import Array
 from der_planner.identification.air import AirFit, fit_air
-from der_planner.identification.bends import (
-    COLUMN,
-    GROUPS,
-    MOST_FITS,
-    NODES,
-    OPTIONAL,
-    TERMS,
-    BendFit,
-    FreeTerms,
-    values_of,
-    without,
-)
+from der_planner.identification.bends import MOST_FITS, NODES, BendFit
 from der_planner.identification.lengths import (
     GeometryFit,
     GivesWayError,
@@ -42,6 +31,15 @@ from der_planner.identification.log import (
 )
 from der_planner.identification.report import FitReport
 from der_planner.identification.stiffness import HungWeight, stiffness_in_motion
+from der_planner.identification.terms import (
+    COLUMN,
+    GROUPS,
+    OPTIONAL,
+    TERMS,
+    FreeTerms,
+    values_of,
+    without,
+)
 from der_planner.identification.told import (
     against_motion,
     at_bounds,

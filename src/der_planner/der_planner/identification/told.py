@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from der_planner.arrays import Array
-from der_planner.identification.bends import TERMS, BendFit, FreeTerms
+from der_planner.identification.bends import BendFit
 from der_planner.identification.report import Unknown, readable
+from der_planner.identification.terms import TERMS, FreeTerms
 from der_planner.limb import Term
 
 Mask = NDArray[np.bool_]

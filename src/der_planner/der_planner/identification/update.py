@@ -18,19 +18,16 @@ import numpy as np
 
 from der_planner.arrays import Array
 from der_planner.identification.bends import (
-    COLUMN,
     CORRELATION,
     LEAST_ERRORS,
     MOST_FITS,
     NODES,
     BendFit,
-    FreeTerms,
-    to_limb,
-    values_of,
 )
 from der_planner.identification.least_squares import LeastSquares, Rows, with_differences
 from der_planner.identification.log import LEAST_MOTION, CalibrationLog, LogError, Prepared, prepare
 from der_planner.identification.report import readable
+from der_planner.identification.terms import COLUMN, FreeTerms, to_limb, values_of
 from der_planner.identification.told import UNTOLD
 from der_planner.limb import Limb, Term
 from der_planner.limb.parameters import REST_SPREAD

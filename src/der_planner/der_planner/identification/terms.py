@@ -1,0 +1,177 @@
+"""What a fit may change: parameters of segments, in units that angles and pressures tell."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+from itertools import compress
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from der_planner.arrays import Array
+from der_planner.identification.least_squares import Unknowns
+from der_planner.limb import Limb, Segment, Term, declarations
+
+AnyTerms = TypeVar("AnyTerms", bound="FreeTerms")
+GROUPS = ("asymmetry", "stiffening", "cubic", "coupling", "friction", "creep", "dynamics")
+"""Model terms that may be left out, in the order in which they are explained."""
+OPTIONAL = ("mass",)
+"""Model terms that are fitted only on request: the mass, in place of the stiffness. A log without
+measured forces shows only ratios of stiffness, gain and mass, so one of them must be given."""
+_ORDER = ("linear", *GROUPS, *OPTIONAL)
+_DECLARED = {key: item for key, item in declarations(Segment).items() if item.fit}
+_FIELDS = {item.fit.name: key for key, item in _DECLARED.items() if item.fit}
+TERMS: tuple[Term, ...] = tuple(
+    sorted(
+        (item.fit for item in _DECLARED.values() if item.fit),
+        key=lambda term: (_ORDER.index(term.group), term.relative),
+    )
+)
+"""Terms of each segment, as the fields of `Segment` declare them, by group. Damping by the air and
+the plate is one number for the limb: it cannot be told apart by segments."""
+COLUMN = {term.name: index for index, term in enumerate(TERMS)}
+"""Place of each term in `TERMS` by its name."""
+
+
+@dataclass(frozen=True)
+class FreeTerms:
+    """The terms of a limb that a fit may change.
+
+    Attributes:
+        limb: with the numbers that are known before.
+        values: (M, T) values of all terms.
+        places: P pairs of segment and term that are free; a shared term stands in segment 0.
+        terms: (P,) the free terms, with what is known of them.
+    """
+
+    limb: Limb
+    values: Array
+    places: tuple[tuple[int, int], ...]
+    terms: tuple[Term, ...]
+
+    @classmethod
+    def of(
+        cls: type[AnyTerms], limb: Limb, names: Collection[str], values: Array | None = None
+    ) -> AnyTerms:
+        """Return the terms of these names in all segments that have them.
+
+        Args:
+            limb: with the numbers that are known before.
+            names: of terms.
+            values: (M, T) of all terms; None: the limb's.
+        """
+        places = tuple(
+            (segment, index)
+            for segment in range(limb.segment_count)
+            for index, term in enumerate(TERMS)
+            if term.name in names
+            and (segment == 0 or not term.shared)
+            and 0 <= segment + term.neighbour < limb.segment_count
+        )
+        terms = tuple(TERMS[index] for _, index in places)
+        return cls(limb, values_of(limb) if values is None else values, places, terms)
+
+    @property
+    def unknowns(self) -> Unknowns:
+        """What is known of the free terms."""
+        known = [(term.spread, term.low, term.high, term.scale) for term in self.terms]
+        return Unknowns(self.at_places(self.values), *np.reshape(known, (-1, 4)).T)
+
+    def only(self, chosen: NDArray[np.bool_]) -> FreeTerms:
+        """Return those of the terms that are chosen (P,)."""
+        places, terms = compress(self.places, chosen), compress(self.terms, chosen)
+        return replace(self, places=tuple(places), terms=tuple(terms))
+
+    def told(self, name: str, value: Array, deviation: Array) -> FreeTerms:
+        """Return the terms where something else than the log has measured one of each segment.
+
+        Args:
+            name: of the term.
+            value: (M,) measured.
+            deviation: (M,) standard deviation of it; what was known before counts by its own.
+        """
+        values, terms, column = self.values.copy(), list(self.terms), COLUMN[name]
+        for index, (segment, place) in enumerate(self.places):
+            if place != column:
+                continue
+            spread = terms[index].spread
+            share = 1.0 / (1.0 + (deviation[segment] / spread) ** 2)
+            values[segment, column] += share * (value[segment] - values[segment, column])
+            terms[index] = replace(terms[index], spread=spread * math.sqrt(1.0 - share))
+        return replace(self, values=values, terms=tuple(terms))
+
+    def at_places(self, table: Array) -> Array:
+        """Return the values (P,) of the free terms in a table (M, T)."""
+        return np.array([table[place] for place in self.places])
+
+    def limb_with(self, free: Array) -> Limb:
+        """Return the limb with values (P,) of the free terms put in place."""
+        values = self.values.copy()
+        for (segment, index), value in zip(self.places, free, strict=True):
+            values[slice(None) if TERMS[index].shared else segment, index] = value
+        return to_limb(self.limb, values)
+
+
+def values_of(limb: Limb, *, starts: bool = False) -> Array:
+    """Return the (M, T) values of a limb.
+
+    Args:
+        limb: to describe.
+        starts: put plausible friction and creep where it has none, for a search to begin at.
+    """
+    return np.array(
+        [[_value(segment, term, starts) for term in TERMS] for segment in limb.segments]
+    )
+
+
+def to_limb(prior: Limb, values: Array) -> Limb:
+    """Return the prior with the values (M, T) of all terms put in place."""
+    segments = (
+        _segment(segment, dict(zip(COLUMN, map(float, row), strict=True)))
+        for segment, row in zip(prior.segments, values, strict=True)
+    )
+    return replace(prior, segments=tuple(segments))
+
+
+def without(values: Array, groups: Collection[str]) -> Array:
+    """Return the values (M, T) with the terms outside ``groups`` switched off."""
+    result = values.copy()
+    for index, term in enumerate(TERMS):
+        if term.group in groups or term.group == "linear":
+            continue
+        keeps = term.kept or _DECLARED[_FIELDS[term.name]].needs
+        if term.relative or not keeps:
+            result[:, index] = 0.0
+    return result
+
+
+def _value(segment: Segment, term: Term, starts: bool) -> float:
+    if term.relative:
+        return 0.0
+    value = float(getattr(segment, _FIELDS[term.name]))
+    for other, power in term.per.items():
+        value *= getattr(segment, other) ** power
+    return value or (term.start if starts else 0.0)
+
+
+def _segment(prior: Segment, value: dict[str, float]) -> Segment:
+    # In the order of declaration, since a term's unit takes parameters that were declared before.
+    found: dict[str, float] = dataclasses.asdict(prior)
+    for key, declared in _DECLARED.items():
+        term = declared.fit
+        assert term is not None
+        same_unit = all(found[other] == getattr(prior, other) for other in term.per)
+        if same_unit and value[term.name] == _value(prior, term, starts=False):
+            continue  # so that the number of the limb file stays to the last digit
+        if term.relative:
+            found[key] *= math.exp(value[term.name])
+            continue
+        divisor = math.prod(found[other] ** power for other, power in term.per.items())
+        found[key] = value[term.name] / divisor
+        if declared.needs and not found[declared.needs]:
+            found[key] = 0.0
+    return Segment(**found)
