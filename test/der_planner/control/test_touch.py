@@ -6,10 +6,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from der_planner.control.force import untouched
 from der_planner.control.free_level import FreeLevel, Lacking
 from der_planner.control.knowledge import Knowledge
 from der_planner.control.reaction import Reaction
-from der_planner.control.touch import TouchSense, untouched
+from der_planner.control.touch import TouchSense
 from der_planner.limb import Limb
 from der_planner.model import RodModel
 from der_planner.model.compliance import compliance

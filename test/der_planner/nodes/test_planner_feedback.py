@@ -66,7 +66,7 @@ def test_the_end_of_a_motion_ends_its_touch_and_says_why_it_vented():
     from dataclasses import replace
     from unittest.mock import Mock
 
-    from der_planner.control.touch import untouched
+    from der_planner.control.force import untouched
     from der_planner.nodes.planner_feedback import Corrector
 
     output, schedule, feedback = Mock(), Mock(), Mock()
@@ -90,7 +90,7 @@ def test_a_touch_is_published_and_drawn_while_it_lasts():
 
     from visualization_msgs.msg import Marker
 
-    from der_planner.control.touch import untouched
+    from der_planner.control.force import untouched
     from der_planner.limb import Limb
     from der_planner.nodes.planner_topics import PlannerPublishers
     from der_planner.planning import Motion, plan

@@ -12,9 +12,10 @@ import numpy as np
 
 from der_planner.arrays import Array, interpolate
 from der_planner.control.estimation import Estimator
+from der_planner.control.force import Touch
 from der_planner.control.knowledge import EstimatorSettings
 from der_planner.control.nominal import STEP, ChamberLog, Nominal
-from der_planner.control.touch import Touch, TouchSense
+from der_planner.control.touch import TouchSense
 from der_planner.model import CONTROL_PERIOD, STEPS
 from der_planner.planning.plan_file import Plan
 

@@ -1,21 +1,9 @@
 """Touch: what pressures, loads and friction do not explain of the shape is a force.
 
-The estimator (`der_planner.control.estimation`) says per segment the pressure d + g w that the
-model lacks, and a displacement b of the tip that the bend angles do not explain. A force f at a
-place s makes both, by the compliance of the rod (`der_planner.model.compliance`): with C_θ and C_r
-of bend and tip by the force, C_w of the bend by pressure, and J = ∂tip/∂θ of evenly bent segments,
-
-    lacking pressure = C_w⁻¹ C_θ(s) f        b = (C_r(s) − J C_θ(s)) f
-
-These are M + 2 numbers for the three unknowns of a force in the plane. They hardly show the part of
-a force that acts along the limb. What touches the limb from its side pushes across it, with some
-friction: the part along the limb is therefore expected to be a share of the part across it. For
-each place the most likely force follows from linear equations. The likelihood of all places, each
-with its force, then gives place and force, with their deviations.
-
-Without contact the same numbers are not zero either (`der_planner.control.free_level`). A distance
-from that free level which noise would pass once in an hour is a touch. A seventh of it is a
-suspicion: friction may hide a light touch for seconds.
+`der_planner.control.force` says which force, and where it acts. Without contact what a model lacks
+is not zero either (`der_planner.control.free_level`). A distance from that free level which noise
+would pass once in an hour is a touch. A seventh of it is a suspicion: friction may hide a light
+touch for seconds.
 
 A payload is told apart from a touch in this way: it begins at once to pull at the tip along
 gravity, and goes on. It is weighed, and is part of the free level from then on; one that is taken
@@ -27,17 +15,24 @@ from __future__ import annotations
 
 import copy
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
-from scipy.special import gammainccinv
 
 from der_planner.arrays import Array
+from der_planner.control.force import (
+    EFFECT_WRONG,
+    UNLIKELY,
+    Touch,
+    effects,
+    exceeded,
+    locate,
+    untouched,
+)
 from der_planner.control.free_level import FreeLevel, Lacking
 from der_planner.control.knowledge import Knowledge
 from der_planner.control.nominal import Nominal
 from der_planner.model import CONTROL_PERIOD, RodModel
-from der_planner.model.compliance import compliance
 
 _HOUR = 3600.0
 _CORRELATED = 0.3
@@ -62,16 +57,6 @@ _EARLIER = 4
 """Number of touches whose free levels are kept."""
 _LONGEST = 1.0
 """Time between two pictures of which something is learned, at most [s]."""
-_LARGEST_FORCE = 2.0
-"""Standard deviation of the forces across the limb that are expected [N]."""
-_RUBS = 0.3
-"""Standard deviation of a force along the limb, over the force across it at the same place."""
-_LEAST_ALONG = 0.01
-"""Force along the limb that is expected anyway, a standard deviation [N]."""
-_EFFECT_WRONG = 0.1
-"""Standard deviation of what a weight or a force is said to do, over that."""
-_UNEVEN = 0.02
-"""The same of how far the tip moves beside its bend, over how far the bend moves it."""
 _AT_ONCE = 0.5
 """Time over which what is lacking and pressures are compared when a touch is noticed [s]."""
 _FASTER = 1.3
@@ -91,57 +76,6 @@ _LEAST_GRAVITY = 1.0
 """In the plane, for which payloads are told [m/s²]."""
 _PLACES = 60
 """Places along the limb that are tried."""
-_PLACE_TOLD = 0.1
-"""Standard deviation of the place, over the limb's length, up to which it is told."""
-_UNLIKELY = 1e-3
-"""Probability of what is left of the data below which it is not one force."""
-
-
-@dataclass(frozen=True)
-class Touch:
-    """What is known of a touch at an instant.
-
-    Attributes:
-        time: [s].
-        bend_angles: (M,) of the limb then [rad].
-        touched: whether something touches the limb.
-        since: when it began [s]; NaN: nothing touches.
-        pressure: (M,) effective pressure that bends the limb as the touch does [Pa]; NaN: nothing
-            touches.
-        distance: squared distance from the free level over that of one false alarm in an hour.
-        place: along the limb from its clamp [m]; NaN: it cannot be told.
-        place_deviation: its standard deviation, told or not [m].
-        force: (2,) on the limb [N]; NaN: it cannot be told.
-        force_covariance: (2, 2), told or not [N²].
-        said: a sentence on what is told; empty while nothing touches or pulls.
-        payload: at the tip, beside what was planned [kg].
-        weighed: whether what touches may yet turn out to be a payload.
-        suspected: whether something touches, or may touch while friction hides it.
-    """
-
-    time: float
-    bend_angles: Array
-    touched: bool
-    since: float
-    pressure: Array
-    distance: float
-    place: float
-    place_deviation: float
-    force: Array
-    force_covariance: Array
-    said: str
-    payload: float = 0.0
-    weighed: bool = False
-    suspected: bool = False
-
-
-def untouched(time: float, bend_angles: Array, distance: float = 0.0) -> Touch:
-    """Return that nothing touches a limb of bend angles (M,) [rad] at an instant [s]."""
-    nothing = np.full(2, np.nan)
-    unknown = np.full((2, 2), np.nan)
-    pressure, never = np.full(len(bend_angles), np.nan), np.nan
-    about = pressure, distance, np.nan, np.nan, nothing, unknown, ""
-    return Touch(time, bend_angles, False, never, *about)
 
 
 class TouchSense:
@@ -158,7 +92,7 @@ class TouchSense:
         self.free = free or FreeLevel(model.limb)
         limb = model.limb
         self._places = np.linspace(limb.base_length, limb.length, _PLACES + 1)[1:]
-        self.threshold = _chance(_CORRELATED / _HOUR, model.inputs + 2)
+        self.threshold = exceeded(_CORRELATED / _HOUR, model.inputs + 2)
         self.newest = untouched(-np.inf, np.zeros(model.inputs))
         self._rate, self._slid = np.zeros((2, model.inputs))
         self._stuck, self._variance = np.zeros((2, model.inputs)), np.zeros(model.inputs + 2)
@@ -341,11 +275,11 @@ class TouchSense:
             self._weighed.clear()
             self._came_at_once = self._comes_at_once()
         weight = self._weight_effect(away.bend_angles)
-        inverse = np.linalg.inv(away.doubtful + np.diag((_EFFECT_WRONG * away.value) ** 2))
+        inverse = np.linalg.inv(away.doubtful + np.diag((EFFECT_WRONG * away.value) ** 2))
         pull = float(weight @ inverse @ weight)
         mass = float(weight @ inverse @ away.value) / pull
         left = float(away.value @ inverse @ away.value) - mass**2 * pull
-        alone = left < _chance(_UNLIKELY**2, len(weight) - 1)
+        alone = left < exceeded(UNLIKELY**2, len(weight) - 1)
         self._weighed.append((age, mass, alone))
         ages, masses, alones = np.array(self._weighed).T
         newest = ages > age - _WEIGHED
@@ -359,99 +293,3 @@ class TouchSense:
         if told:
             self.free.payload = max(0.0, self.free.payload + mean)
         return told, perhaps
-
-
-def locate(model: RodModel, lacking: Lacking, places: Array) -> Touch:
-    """Return the force that explains what the model lacks, and where it acts.
-
-    Args:
-        model: rod of the limb.
-        lacking: of the model, less the free level, with the covariance of that.
-        places: (P,) evenly spaced, where the force may act [m].
-    """
-    axes = _axes(model, lacking.bend_angles, places)
-    effect = effects(model, lacking.bend_angles, places) @ axes
-    bent = compliance(model, lacking.bend_angles, places[-1:]).bend_by_pressure
-    moved = model.kinematics.tip_jacobians(lacking.bend_angles) @ bent @ lacking.value[:-2]
-    doubt = _EFFECT_WRONG * lacking.value
-    doubt[-2:] = _UNEVEN * np.linalg.norm(moved)
-    weight = np.linalg.inv(lacking.doubtful + np.diag(doubt**2))
-    seen = np.swapaxes(effect, 1, 2) @ weight
-    square, pull = seen @ effect, seen @ lacking.value
-    across = pull[:, 1] / (square[:, 1, 1] + 1.0 / _LARGEST_FORCE**2)
-    expected = np.full_like(pull, _LARGEST_FORCE)
-    expected[:, 0] = _LEAST_ALONG + _RUBS * np.abs(across)
-    told = square + (expected**-2.0)[:, :, None] * np.eye(2)
-    forces = np.linalg.solve(told, pull[..., None])[..., 0]
-    left = lacking.value @ weight @ lacking.value - (pull * forces).sum(axis=1)
-    likely = -0.5 * (left + np.linalg.slogdet(told)[1]) - np.log(expected[:, 0])
-    share = np.exp(likely - likely.max())
-    share /= share.sum()
-    place = float(share @ places)
-    deviation = float(np.sqrt(share @ (places - place) ** 2 + (places[1] - places[0]) ** 2 / 12))
-    turned = np.einsum("pab,pb->pa", axes, forces)
-    force = share @ turned
-    apart = turned - force
-    spread = axes @ np.linalg.inv(told) @ np.swapaxes(axes, 1, 2)
-    spread = spread + apart[:, :, None] * apart[:, None, :]
-    covariance = np.einsum("p,pab->ab", share, spread)
-    known = replace(
-        untouched(lacking.time, lacking.bend_angles),
-        touched=True,
-        since=lacking.time,
-        pressure=lacking.value[:-2],
-        place=place,
-        place_deviation=deviation,
-        force=force,
-        force_covariance=covariance,
-    )
-    return _told(known, float(left.min()), model)
-
-
-def effects(model: RodModel, bend_angles: Array, places: Array) -> Array:
-    """Return what a unit force makes the model lack (P, M + 2, 2) [Pa/N], [m/N], see the module."""
-    limp = compliance(model, bend_angles, places)
-    jacobian = model.kinematics.tip_jacobians(bend_angles)
-    lacking = np.linalg.solve(limp.bend_by_pressure, limp.bend)
-    return np.concatenate([lacking, limp.tip - jacobian @ limp.bend], axis=1)
-
-
-def _axes(model: RodModel, bend_angles: Array, places: Array) -> Array:
-    """Return the directions along and across the limb at places, as columns (P, 2, 2)."""
-    even = model.kinematics
-    edges = np.searchsorted(np.cumsum(even.rest_lengths[:-1]) + even.base, places)
-    heading = even.turning[edges] @ bend_angles
-    cosine, sine = np.cos(heading), np.sin(heading)
-    return np.moveaxis(np.array([[cosine, -sine], [sine, cosine]]), 2, 0)
-
-
-def _told(found: Touch, left: float, model: RodModel) -> Touch:
-    """Say what can be told of a force, and leave out what cannot.
-
-    Args:
-        found: place and force of the largest likelihood.
-        left: squared distance of the data from the best force.
-        model: of the limb.
-    """
-    nothing = np.full(2, np.nan)
-    spare = max(1, model.inputs - 1)
-    if left > _chance(_UNLIKELY, spare):
-        said = "at several points, or the model is wrong otherwise: no single force explains it"
-        return replace(found, place=np.nan, force=nothing, said=said)
-    deviations, directions = np.linalg.eigh(found.force_covariance)
-    size = float(np.linalg.norm(found.force))
-    said = f"{size:.2f} N"
-    where = f"at {found.place * 100:.1f} cm (± {found.place_deviation * 100:.1f})"
-    if found.place_deviation > _PLACE_TOLD * model.limb.length:
-        found, where = replace(found, place=np.nan), "its place is not known"
-    widest = float(np.sqrt(deviations[-1]))
-    if widest > size:
-        x, y = directions[:, -1]
-        said = f"its force is not known along ({x:.2f}, {y:.2f}): ± {widest:.2f} N"
-        found = replace(found, force=nothing)
-    return replace(found, said=f"{said}, {where}")
-
-
-def _chance(probability: float, count: int) -> float:
-    """Return what the sum of ``count`` squares of normal numbers exceeds with a probability."""
-    return float(2.0 * gammainccinv(count / 2, probability))

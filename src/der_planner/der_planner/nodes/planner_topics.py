@@ -21,8 +21,8 @@ from der_msgs.msg import (
     PressureState,
 )
 from der_planner.arrays import Array, interpolate
+from der_planner.control.force import Touch
 from der_planner.control.knowledge import Estimate
-from der_planner.control.touch import Touch
 from der_planner.planning import Plan
 from der_planner.planning.streaming import GRID, Ending, Schedule
 from limb_interfaces import qos, topics
