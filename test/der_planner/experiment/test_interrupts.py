@@ -5,6 +5,8 @@ import signal
 import pytest
 
 from der_planner.experiment.console import interrupt_once
+from der_planner.experiment.graph_trials import warning_of
+from der_planner.experiment.processes import GraphError
 from limb_interfaces.entry import END_SIGNALS
 
 
@@ -19,3 +21,13 @@ def test_a_second_signal_does_not_cut_the_end_short(number: signal.Signals):
     finally:
         for each, handler in before.items():
             signal.signal(each, handler)
+
+
+@pytest.mark.parametrize("state", ["vented", "idle"])
+def test_a_plan_that_was_ended_is_no_trial(state: str):
+    told = {"plan_id": "mine", "state": "streaming", "reason": "a slow limb"}
+    assert warning_of(told, "mine") == "a slow limb"
+    told |= {"state": state, "reason": "something touched the limb"}
+    assert warning_of(told, "another") == ""
+    with pytest.raises(GraphError, match="not played to its end: something touched the limb"):
+        warning_of(told, "mine")

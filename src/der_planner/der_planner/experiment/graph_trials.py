@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import uuid
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -79,15 +80,13 @@ def play_on_graph(run: TrialRun, progress: Progress) -> dict[str, Any]:
             )
             shown: list[str] = []
 
-            def show_warnings() -> None:
-                told = client.diagnostic_values("planner")
-                played = (told.get("plan_id"), told.get("state")) == (plan.plan_id, "streaming")
-                if played and not shown:
-                    shown.append(told.get("reason", ""))
-                    if shown[0]:
-                        progress.say(f"  warning: {shown[0]}")
+            def show_warning() -> None:
+                warning = warning_of(client.diagnostic_values("planner"), plan.plan_id)
+                if warning and not shown:
+                    shown.append(warning)
+                    progress.say(f"  warning: {warning}")
 
-            graph.play(stamps.seconds(plan.header.stamp), float(plan.time[-1]), show_warnings)
+            graph.play(stamps.seconds(plan.header.stamp), float(plan.time[-1]), show_warning)
     factor = graph.real_time_factor
     return {
         "bag": str(graph.bag.relative_to(options.out)),
@@ -174,6 +173,20 @@ def _plan_of(run: TrialRun, client: GraphClient) -> PressurePlan | None:
     if told.get("state") == "refused":
         raise GraphError(f"the planner refused: {told.get('reason', 'no reason given')}")
     return None
+
+
+def warning_of(told: Mapping[str, str], plan_id: str) -> str:
+    """Return what the planner's diagnostics warn of a plan that is played; empty: nothing.
+
+    Raises:
+        GraphError: the plan was ended, by a vent or a cancellation.
+    """
+    if told.get("plan_id") != plan_id:
+        return ""
+    state, reason = told.get("state"), told.get("reason", "")
+    if state in ("vented", "idle"):
+        raise GraphError(f"the motion was not played to its end: {reason}")
+    return reason if state == "streaming" else ""
 
 
 # A calibration -----------------------------------------------------------------------------------
