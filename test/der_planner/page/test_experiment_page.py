@@ -22,7 +22,7 @@ from websockets.sync.client import connect
 from der_planner.commands import run_experiment
 from der_planner.experiment.console import Progress
 from der_planner.experiment.options import Options
-from der_planner.experiment.processes import PAGE_TOKEN
+from der_planner.experiment.processes import PAGE_TOKEN, GraphError
 from limb_interfaces.entry import END_SIGNALS
 
 pytestmark = pytest.mark.graph
@@ -44,12 +44,17 @@ class Visitor:
 
     def look(self) -> tuple[str, bool]:
         """Return what the experiment says of itself, and whether the page has its report."""
+        data = self.data()
+        said = [node["message"] for node in data["nodes"] if node["own"] == "experiment"]
+        return "".join(said), data["report"]
+
+    def data(self) -> dict[str, Any]:
+        """Return what the page is sent."""
         address, origin = f"ws://127.0.0.1:{self.port}/live", f"http://127.0.0.1:{self.port}"
         with connect(address, origin=origin, additional_headers=self._headers) as live:  # type: ignore[arg-type]
             live.send("0 window tab")
             data: dict[str, Any] = json.loads(live.recv(timeout=10.0))
-        said = [node["message"] for node in data["nodes"] if node["own"] == "experiment"]
-        return "".join(said), data["report"]
+        return data
 
 
 @pytest.fixture
@@ -97,3 +102,31 @@ def test_the_page_is_there_before_the_first_run_and_after_the_last(
     assert seen == ["all went well"]
     with pytest.raises(URLError):
         visitor.get("/")
+
+
+def test_the_page_says_why_an_experiment_has_stopped_and_stays(
+    visitor: Visitor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    why, seen = "the motion was not played to its end: the driver was told to vent", [False]
+
+    def alarms() -> bool:
+        texts = [alarm["text"] for alarm in visitor.data()["alarms"]]
+        seen[0] = any(text.startswith(f"The experiment has stopped: {why}") for text in texts)
+        return seen[0]
+
+    def read_the_alarm() -> None:
+        try:
+            wait_for(alarms, "the alarm")
+        finally:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    reader = threading.Thread(target=read_the_alarm)
+
+    def play(options: Options, progress: Progress) -> None:
+        reader.start()
+        raise GraphError(why)
+
+    monkeypatch.setattr(run_experiment, "run", play)
+    assert run_experiment.main() == 1
+    reader.join()
+    assert seen[0]

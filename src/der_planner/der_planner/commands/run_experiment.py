@@ -26,6 +26,7 @@ from typing import Any
 from der_planner.commands.learn import add_run, learning_summary
 from der_planner.control import Learner, LearningError
 from der_planner.experiment.console import (
+    FAILED,
     OptionError,
     Progress,
     check_folder,
@@ -65,15 +66,13 @@ from der_planner.results.report import instrument_table
 
 Kept = list[tuple[Trial, dict[str, Any]]]
 """Finished runs, each with what the ledger holds of it."""
+FAILURES = (GraphError, NodeError, PlanningError, LearningError, LogError)
+"""What may end an experiment before its last trial."""
 
 
 def main() -> int:
     """Run the command line; 0 when every trial was played, 1 after an error, 2 for bad options."""
-    return run_command(
-        _main,
-        *(GraphError, NodeError, PlanningError, LearningError, LogError),
-        stopped="the same --out goes on from here",
-    )
+    return run_command(_main, *FAILURES, stopped="the same --out goes on from here")
 
 
 def _main() -> int:
@@ -89,12 +88,16 @@ def _main() -> int:
     progress = Progress()
     check_folder(options.out)
     with experiment_page(options, progress) as page:
-        run(options, progress)
+        code, said = 0, "done; the page stays with the report"
+        try:
+            run(options, progress)
+        except FAILURES as error:
+            code, said = 1, f"{FAILED}{error}; the page stays"
         with contextlib.suppress(KeyboardInterrupt):
-            progress.say("done; the page stays with the report until Ctrl-C")
+            progress.say(f"{said} until Ctrl-C")
             while page.alive:
                 time.sleep(0.5)
-    return 0
+    return code
 
 
 def run(options: Options, progress: Progress | None = None) -> None:

@@ -16,6 +16,9 @@ from types import FrameType
 
 from der_planner.limb import Limb
 
+FAILED = "error: "
+"""Begins what is said of a command that has failed."""
+
 
 class OptionError(ValueError):
     """The command line or the hardware file asks for something impossible; says what and why."""
@@ -102,9 +105,9 @@ def run_command(
     try:
         return work()
     except OptionError as error:
-        code, said = 2, f"error: {error}"
+        code, said = 2, f"{FAILED}{error}"
     except failures as error:
-        said = f"error: {error}"
+        said = f"{FAILED}{error}"
     except KeyboardInterrupt as error:
         code, said = 130, f"stopped by {error or 'SIGINT'}{stopped and '; '}{stopped}"
     print(said, file=sys.stderr)

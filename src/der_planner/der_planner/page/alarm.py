@@ -166,7 +166,9 @@ def _of_touch(snapshot: dict[str, Any], planner: dict[str, Any] | None) -> Itera
 
 
 def _of_nodes(own: dict[str, dict[str, Any]]) -> Iterator[Alarm]:
-    """Yield the other nodes of this limb that are dead."""
+    """Yield the other nodes of this limb that are dead, and an experiment that has failed."""
+    if (experiment := own.get("experiment")) and experiment["state"] == "error":
+        yield Alarm("danger", f"The experiment has stopped: {experiment['message']}", None, "")
     for name, meaning in NODES.items():
         node = own.get(name)
         if name != DRIVER and node is not None and node["state"] == "dead":
