@@ -61,13 +61,13 @@ def message_class(type_name: str) -> Any:
     Raises:
         DefinitionError: its package is not installed here.
     """
-    package, _, short = type_name.split("/")
     try:
+        package, _, short = type_name.split("/")
         return getattr(importlib.import_module(f"{package}.msg"), short)
-    except (ImportError, AttributeError) as error:
+    except (ImportError, AttributeError, ValueError) as error:
         raise DefinitionError(
             f"no class of the message type '{type_name}' ({error}): source the workspace of "
-            f"{package}, or leave its topics out"
+            "its package, or leave its topics out (exclude)"
         ) from error
 
 

@@ -95,9 +95,12 @@ def _main(given: argparse.Namespace) -> int:
     _check(given)
     loads = Loads.given(given)
     bare = Limb.from_yaml(given.prior) if given.prior else Limb.default()
-    prior = loads.loaded(bare if given.mass is None else bare.weighing(given.mass))
-    if given.weight is not None:
-        prior.carrying(given.weight, given.at, name="weight")  # refuses what cannot hang there
+    try:
+        prior = loads.loaded(bare if given.mass is None else bare.weighing(given.mass))
+        if given.weight is not None:
+            prior.carrying(given.weight, given.at, name="weight")  # refuses what cannot hang there
+    except LimbError as error:
+        raise OptionError(str(error)) from error
     if given.excitation:
         run = _excitation(prior, prior.pneumatics.pressure_limit, given)
         write_excitation(run, given.excitation)
@@ -213,6 +216,8 @@ def _check(given: argparse.Namespace) -> None:
         OptionError: names the option and what it may be.
     """
     for wrong, said in (
+        (given.csv and not given.columns, "--csv needs --columns FILE"),
+        (given.weight == 0.0, "--weight is 0 kg: give what the weight weighs"),
         (given.hardware and not given.graph, "--hardware goes with --graph"),
         (given.folder and not given.graph, "--folder goes with --graph"),
         (
@@ -293,9 +298,10 @@ def _excitation(prior: Limb, pressure_limit: float, given: argparse.Namespace) -
     run = calibration_run(AMPLITUDE * pressure_limit, prior.segment_count, given.quick)
     if given.weight is None:
         return run
-    at, said = run.duration + FREE, f"hang {given.weight:g} kg on at {given.at:g} m"
-    print(f"be ready to {said} after {at:.0f} s, when you are told to", file=sys.stderr)
-    now = f"  NOW {said}, and leave it there until the run ends in {REST - FREE:.0f} s"
+    at, end = run.duration + FREE, run.duration + REST
+    said = f"hang {given.weight:g} kg on at {given.at:g} m, and leave it there"
+    print(f"after {at:.0f} s, {said} until the run ends after {end:.0f} s", file=sys.stderr)
+    now = f"  NOW {said} until the run ends in {REST - FREE:.0f} s"
     return dataclasses.replace(run.with_rest(REST), prompts={round(at / CONTROL_PERIOD): now})
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 
-from der_planner.limb import Limb
+from der_planner.limb import Limb, LimbError
 
 FAILED = "error: "
 """Begins what is said of a command that has failed."""
@@ -210,9 +210,12 @@ class Loads:
         """Return a limb as it is mounted here, with the payload.
 
         Raises:
-            LimbError: the mounting is unknown, or the payload is too heavy or not on the limb.
+            OptionError: the mounting is unknown, or the payload is too heavy or not on the limb.
         """
-        return self.mounted(limb).carrying(self.payload, self.payload_at)
+        try:
+            return self.mounted(limb).carrying(self.payload, self.payload_at)
+        except LimbError as error:
+            raise OptionError(str(error)) from error
 
     def unloaded(self, limb: Limb) -> Limb:
         """Return a limb of `loaded` without the payload, which was put on last."""

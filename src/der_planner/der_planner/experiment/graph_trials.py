@@ -179,12 +179,12 @@ def warning_of(told: Mapping[str, str], plan_id: str) -> str:
     """Return what the planner's diagnostics warn of a plan that is played; empty: nothing.
 
     Raises:
-        GraphError: the plan was ended, by a vent or a cancellation.
+        GraphError: the plan was ended by a vent, a silent driver or a cancellation.
     """
     if told.get("plan_id") != plan_id:
         return ""
     state, reason = told.get("state"), told.get("reason", "")
-    if state in ("vented", "idle"):
+    if state in ("vented", "lost", "idle"):
         raise GraphError(f"the motion was not played to its end: {reason}")
     return reason if state == "streaming" else ""
 

@@ -188,9 +188,9 @@ class Limb:
                 "of its masses, which are part of it"
             )
         factor = (mass - fittings) / self._own_mass
-        if factor > MOST_CARRIED:
+        if not 1.0 / MOST_CARRIED <= factor <= MOST_CARRIED:
             raise LimbError(
-                f"{mass:g} kg are {factor:.0f} times what the limb file says, {self.mass:.3g} kg: "
+                f"{mass:g} kg are {factor:.4g} times what the limb file says, {self.mass:.3g} kg: "
                 "give kg"
             )
 
@@ -218,6 +218,8 @@ class Limb:
         """
         if payload == 0:
             return self
+        if not payload > 0:
+            raise LimbError(f"the {name} must be at least 0 kg, got {payload:g}")
         if payload > MOST_CARRIED * self.mass:
             raise LimbError(
                 f"the {name} of {payload:g} kg is {payload / self.mass:.0f} times the limb's mass: "

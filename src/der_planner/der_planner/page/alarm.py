@@ -156,12 +156,13 @@ def start_of(name: str, node: dict[str, Any] | None) -> str:
 
 def _of_touch(snapshot: dict[str, Any], planner: dict[str, Any] | None) -> Iterator[Alarm]:
     """Yield what touches the limb, or that the limb was vented for it."""
-    contact, driver = snapshot["contact"], snapshot["driver"]
+    contact, driver, sources = snapshot["contact"], snapshot["driver"], snapshot["sources"]
     reason = planner["values"].get("reason", "") if planner is not None else ""
-    if contact is not None and contact["touched"] and snapshot["sources"]["contact"]["fresh"]:
+    rests = sources["driver"]["fresh"] and driver["mode"] == "disarmed"
+    if contact is not None and contact["touched"] and sources["contact"]["fresh"]:
         told = f"Something touches the limb: {contact['said']}"
         yield Alarm("notice", told, None, "look at the limb, and vent it where that must not be")
-    elif reason.startswith(TOUCHED) and driver is not None and driver["mode"] == "disarmed":
+    elif reason.startswith(TOUCHED) and rests:
         yield Alarm("danger", f"The limb was vented: {reason}", None, "free the limb, then arm")
 
 
