@@ -26,7 +26,6 @@ from typing import Any
 from der_planner.commands.learn import add_run, learning_summary
 from der_planner.control import Learner, LearningError
 from der_planner.experiment.console import (
-    FAILED,
     OptionError,
     Progress,
     check_folder,
@@ -88,16 +87,15 @@ def _main() -> int:
     progress = Progress()
     check_folder(options.out)
     with experiment_page(options, progress) as page:
-        code, said = 0, "done; the page stays with the report"
         try:
             run(options, progress)
+            progress.say("done; the page stays with the report until Ctrl-C")
         except FAILURES as error:
-            code, said = 1, f"{FAILED}{error}; the page stays"
+            progress.fail(f"{error}; the page stays until Ctrl-C")
         with contextlib.suppress(KeyboardInterrupt):
-            progress.say(f"{said} until Ctrl-C")
             while page.alive:
                 time.sleep(0.5)
-    return code
+    return 1 if progress.failed else 0
 
 
 def run(options: Options, progress: Progress | None = None) -> None:

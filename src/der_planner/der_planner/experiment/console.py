@@ -16,9 +16,6 @@ from types import FrameType
 
 from der_planner.limb import Limb, LimbError
 
-FAILED = "error: "
-"""Begins what is said of a command that has failed."""
-
 
 class OptionError(ValueError):
     """The command line or the hardware file asks for something impossible; says what and why."""
@@ -33,12 +30,19 @@ class Progress:
         self._open_line = False
         self.newest = "begins"
         """What has been said last, for who shows it elsewhere."""
+        self.failed = False
+        """Whether that is why the command has failed."""
 
     def say(self, text: str) -> None:
         """Print one line."""
         self.newest = text.strip()
         self._end_bar()
         print(text, file=sys.stderr, flush=True)
+
+    def fail(self, text: str) -> None:
+        """Print why the command has failed."""
+        self.say(f"error: {text}")
+        self.newest, self.failed = text, True
 
     def bar(self, done: float, total: float, text: str, unit: str = "s") -> None:
         """Show that ``done`` of ``total`` seconds, or of another unit, are over."""
@@ -105,9 +109,9 @@ def run_command(
     try:
         return work()
     except OptionError as error:
-        code, said = 2, f"{FAILED}{error}"
+        code, said = 2, f"error: {error}"
     except failures as error:
-        said = f"{FAILED}{error}"
+        said = f"error: {error}"
     except KeyboardInterrupt as error:
         code, said = 130, f"stopped by {error or 'SIGINT'}{stopped and '; '}{stopped}"
     print(said, file=sys.stderr)

@@ -18,7 +18,7 @@ from rclpy.executors import ExternalShutdownException
 
 from der_msgs.msg import PressureState
 from der_planner.experiment.client import GraphClient
-from der_planner.experiment.console import FAILED, Progress
+from der_planner.experiment.console import Progress
 from der_planner.experiment.options import Options
 from der_planner.experiment.processes import (
     PAGE_TOKEN,
@@ -315,7 +315,9 @@ def experiment_page(options: Options, progress: Progress) -> Iterator[NodeProces
                 f"the operator's page is at {client.diagnostic_values('page')['url']}"
                 f"?token={PAGE_TOKEN}"
             )
-            DiagnosticsPublisher(client.node, lambda: _health(progress.newest))
+            DiagnosticsPublisher(
+                client.node, lambda: Health("error" if progress.failed else "ok", progress.newest)
+            )
             client.watch(())
             ended = threading.Event()
             speaker = threading.Thread(
@@ -329,12 +331,6 @@ def experiment_page(options: Options, progress: Progress) -> Iterator[NodeProces
                 speaker.join(1.0)
     finally:
         page.stop()
-
-
-def _health(said: str) -> Health:
-    """Return the health of an experiment by what it has said last."""
-    level = "error" if said.startswith(FAILED) else "ok"
-    return Health(level, said.removeprefix(FAILED))
 
 
 def _speak(client: GraphClient, ended: threading.Event) -> None:
