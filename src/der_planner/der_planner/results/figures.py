@@ -13,6 +13,7 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from der_planner.arrays import Array
@@ -38,6 +39,26 @@ DASHES = {"der": "-", "pcc": "--"}
 def colour(model: str, index: int = 0) -> str:
     """Return the colour of a model, or the index-th of the rest for an unknown one."""
     return COLOURS.get(model, OTHER[index % len(OTHER)])
+
+
+def label_of(run: RunSeries) -> str:
+    """Return model and method of a run, which its trials share."""
+    about = run.description
+    return f"{about.model.upper()} ({about.method})" if about.method else about.model.upper()
+
+
+def colours_of(runs: Sequence[RunSeries]) -> dict[str, tuple[float, ...]]:
+    """Return the colour of each label: the model's own, the paler the earlier its method came."""
+    models = {label_of(run): run.description.model for run in runs}
+    of_model = {
+        model: to_rgb(colour(model, i)) for i, model in enumerate(dict.fromkeys(models.values()))
+    }
+    found = {}
+    for label, model in models.items():
+        same = [each for each, other in models.items() if other == model]
+        share = (same.index(label) + 1.0) / len(same)
+        found[label] = tuple(1.0 - (0.3 + 0.7 * share) * (1.0 - part) for part in of_model[model])
+    return found
 
 
 def paper_style() -> AbstractContextManager[None]:
@@ -82,7 +103,10 @@ def shared_legend(figure: Figure, axes: Iterable[Axes]) -> None:
         for axis in axes
         for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)
     }
-    figure.legend(handles.values(), handles.keys(), loc="outside upper center", ncols=4)
+    # A handle with its gaps takes half an inch, a letter of the legend's font less than 0.06 inch.
+    widest = 0.5 + 0.06 * max(map(len, handles), default=0)
+    columns = max(1, int(figure.get_figwidth() / widest))
+    figure.legend(handles.values(), handles.keys(), loc="outside upper center", ncols=columns)
 
 
 def by_motion(runs: Sequence[RunSeries]) -> dict[str, list[RunSeries]]:
@@ -120,17 +144,18 @@ def plot_tip(runs: Sequence[RunSeries], folder: Path) -> list[Path]:
 
 def _draw_tip_row(row: Sequence[Axes], title: str, runs: Sequence[RunSeries]) -> None:
     plane, over_x, over_y = row
-    for index, run in enumerate(runs):
-        model = run.description.model
+    colours = colours_of(runs)
+    for run in runs:
+        label = label_of(run)
         look: dict[str, Any] = {
-            "color": colour(model, index),
-            "alpha": 0.9 if len(runs) <= 4 else 0.5,
+            "color": colours[label],
+            "alpha": 0.9 if len(runs) <= 4 * len(colours) else 0.5,
             "lw": 1.0,
-            "ls": DASHES.get(model, "-."),
+            "ls": DASHES.get(run.description.model, "-."),
         }
         shown = run.tip.between(0.0, run.reference.time[-1])
         tip = shown.value * CM
-        plane.plot(tip[:, 0], tip[:, 1], label=f"{model.upper()}, measured", **look)
+        plane.plot(tip[:, 0], tip[:, 1], label=label, **look)
         over_x.plot(shown.time, tip[:, 0], **look)
         over_y.plot(shown.time, tip[:, 1], **look)
     if drawn := runs[0].description.extra.get(DRAWN):
@@ -160,11 +185,11 @@ def plot_error(runs: Sequence[RunSeries], folder: Path) -> list[Path]:
         figure = Figure(figsize=(wide, 2.2))
         axes = figure.subplots(1, len(motions), squeeze=False, sharey=True)[0]
         for axis, (title, members) in zip(axes, motions.items(), strict=True):
-            for index, (label, same) in enumerate(_by_model(members).items()):
+            for label, look in colours_of(members).items():
+                same = [run for run in members if label_of(run) == label]
                 time, mean, deviation = mean_error(same)
-                model = same[0].description.model
-                look = colour(model, index)
-                axis.plot(time, mean * CM, color=look, ls=DASHES.get(model, "-."), label=label)
+                dash = DASHES.get(same[0].description.model, "-.")
+                axis.plot(time, mean * CM, color=look, ls=dash, label=label)
                 low = np.maximum(mean - deviation, 0.0)
                 axis.fill_between(
                     time, low * CM, (mean + deviation) * CM, color=look, alpha=0.2, lw=0
@@ -174,15 +199,6 @@ def plot_error(runs: Sequence[RunSeries], folder: Path) -> list[Path]:
         axes[0].set_ylabel("tip error [cm]")
         shared_legend(figure, axes)
         return save(figure, folder, "error")
-
-
-def _by_model(runs: Sequence[RunSeries]) -> dict[str, list[RunSeries]]:
-    found: dict[str, list[RunSeries]] = {}
-    for run in runs:
-        about = run.description
-        name = f"{about.model.upper()} ({about.method})" if about.method else about.model.upper()
-        found.setdefault(name, []).append(run)
-    return found
 
 
 def mean_error(runs: Sequence[RunSeries], rate: float = 20.0) -> tuple[Array, Array, Array]:
@@ -222,8 +238,8 @@ def plot_pressures(runs: Sequence[RunSeries], folder: Path) -> list[Path]:
         figure = Figure(figsize=(PAGE, 1.9 * len(motions)))
         axes = figure.subplots(len(motions), segments, squeeze=False, sharex="row")
         for row, (title, members) in zip(axes, motions.items(), strict=True):
-            for index, (label, same) in enumerate(_by_model(members).items()):
-                _draw_pressures(row, same[0], label, colour(same[0].description.model, index))
+            for label, look in colours_of(members).items():
+                _draw_pressures(row, next(run for run in members if label_of(run) == label), look)
             for segment, axis in enumerate(row):
                 axis.set(xlabel="time [s]", ylabel=f"Δp, segment {segment + 1} [kPa]")
             row[0].set_title(title)
@@ -231,16 +247,15 @@ def plot_pressures(runs: Sequence[RunSeries], folder: Path) -> list[Path]:
         return save(figure, folder, "pressures")
 
 
-def _draw_pressures(row: Sequence[Axes], run: RunSeries, label: str, look: str) -> None:
-    looks: dict[str, dict[str, Any]] = {
-        "commanded": {"ls": ":", "lw": 0.9},
-        "measured": {"ls": DASHES.get(run.description.model, "-.")},
-    }
-    for name, dash in looks.items():
+def _draw_pressures(row: Sequence[Axes], run: RunSeries, look: tuple[float, ...]) -> None:
+    kinds: tuple[tuple[str, dict[str, Any]], ...] = (
+        ("commanded", {"ls": ":", "lw": 0.9, "label": "commanded"}),
+        ("measured", {"ls": DASHES.get(run.description.model, "-."), "label": label_of(run)}),
+    )
+    for name, drawn in kinds:
         stream = getattr(run, name).between(0.0, run.reference.time[-1])
         for segment, axis in enumerate(row if len(stream) else ()):
-            value = stream.value[:, segment] / 1000.0
-            axis.plot(stream.time, value, color=look, label=f"{label}, {name}", **dash)
+            axis.plot(stream.time, stream.value[:, segment] / 1000.0, color=look, **drawn)
 
 
 def plot_learning(results: Sequence[RunResult], folder: Path) -> list[Path]:
@@ -261,5 +276,7 @@ def plot_learning(results: Sequence[RunResult], folder: Path) -> list[Path]:
                 axis.semilogy(np.arange(len(errors)), np.array(errors) * CM, "o-", ms=3)
             axis.set(xlabel="runs learned from", title=motion.replace("_", " "))
             axis.xaxis.get_major_locator().set_params(integer=True)
+            axis.yaxis.set_major_formatter("{x:g}")
+            axis.yaxis.set_minor_formatter("{x:.2g}")
         axes[0].set_ylabel("mean tip error [cm]")
         return save(figure, folder, "learning")
