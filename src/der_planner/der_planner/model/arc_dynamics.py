@@ -22,7 +22,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from der_planner.model.arc_kernel import arc_point, solve_symmetric
+from der_planner.model.arc_kernel import arc_point, factorise, substitute
 
 Vector = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -173,7 +173,8 @@ def acceleration(q: Vector, v: Vector, torque: Vector, arcs: Arcs) -> Vector:
             force[i] += J[i].real * felt.real + J[i].imag * felt.imag
             for k in range(i + 1):
                 M[i, k] += mass * (J[i].real * J[k].real + J[i].imag * J[k].imag)
-    solve_symmetric(M, force)
+    factorise(M)
+    substitute(M, force)
     return force
 
 
@@ -215,7 +216,7 @@ def simulate(
 # The linearisation ------------------------------------------------------------------------------
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _third(
     q: Vector, v: Vector, arcs: Arcs, frame: Complex, p: int, point: Any, third: Complex, H: Complex
 ) -> Complex:
@@ -247,13 +248,13 @@ def _third(
 
 
 @njit(cache=True, nogil=True)
-def force_slopes(q: Vector, v: Vector, a: Vector, arcs: Arcs) -> tuple[Vector, Vector]:
-    """Return ∂R/∂q and ∂R/∂v (n, n) of R = M a + (C + D) v + K(q) − gravity's torque.
+def force_slopes(q: Vector, v: Vector, a: Vector, arcs: Arcs) -> tuple[Vector, Vector, Vector]:
+    """Return ∂R/∂q, ∂R/∂v and M (n, n) of R = M a + (C + D) v + K(q) − gravity's torque.
 
     Exact; with v = a = 0 the first is the stiffness of a resting limb.
     """
     n = q.size
-    by_angle, by_rate = np.zeros((n, n)), np.zeros((n, n))
+    by_angle, by_rate, M = np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n))
     J = np.zeros(n, dtype=np.complex128)
     H = np.zeros((n, n), dtype=np.complex128)
     turning = np.zeros(n, dtype=np.complex128)
@@ -282,11 +283,12 @@ def force_slopes(q: Vector, v: Vector, a: Vector, arcs: Arcs) -> tuple[Vector, V
                 by_angle[i, s] += J[i].real * moved.real + J[i].imag * moved.imag
                 moved = 2.0 * mass * turning[s] + drag * J[s]
                 by_rate[i, s] += J[i].real * moved.real + J[i].imag * moved.imag
+                M[i, s] += mass * (J[i].real * J[s].real + J[i].imag * J[s].imag)
     for i in range(n):
         bend = q[i] - arcs.rest[i]
         by_angle[i, i] += arcs.stiffness[i] + 3.0 * arcs.cubic[i] * bend**2
         by_rate[i, i] += arcs.stiffness[i] * arcs.viscous[i]
-    return by_angle, by_rate
+    return by_angle, by_rate, M
 
 
 @njit(cache=True, nogil=True)
@@ -304,9 +306,7 @@ def linearised(
     B = np.zeros((count, substeps, 2 * n, n))
     angles[0], rates[0] = q, v
     h = step / parts
-    inputs = np.zeros((n, 3 * n))
-    for i in range(n):
-        inputs[i, 2 * n + i] = arcs.gain[i]
+    right = np.empty(n)
     for k in range(count):
         for s in range(substeps):
             torque = arcs.gain * pressures[k, s]
@@ -319,16 +319,19 @@ def linearised(
                 q_total, v_total = np.zeros(n), np.zeros(n)
                 d_total = np.zeros((2 * n, 3 * n))
                 for stage in range(4):
-                    M, C, D, weight = inertia(q_stage, v_stage, arcs)
-                    bend = q_stage - arcs.rest
-                    elastic = arcs.stiffness * (bend + arcs.viscous * v_stage)
-                    elastic = elastic + arcs.cubic * bend**3
-                    slope = np.linalg.solve(M, torque + weight - elastic - (C + D) @ v_stage)
-                    by_angle, by_rate = force_slopes(q_stage, v_stage, slope, arcs)
+                    slope = acceleration(q_stage, v_stage, torque, arcs)
+                    by_angle, by_rate, M = force_slopes(q_stage, v_stage, slope, arcs)
+                    factorise(M)
                     d_slope = np.empty((2 * n, 3 * n))
-                    d_slope[:n] = d_stage[n:]
-                    right = inputs - by_angle @ d_stage[:n] - by_rate @ d_stage[n:]
-                    d_slope[n:] = np.linalg.solve(M, right)
+                    for c in range(3 * n):
+                        for i in range(n):
+                            right[i] = arcs.gain[i] if c == 2 * n + i else 0.0
+                            for j in range(n):
+                                right[i] -= by_angle[i, j] * d_stage[j, c]
+                                right[i] -= by_rate[i, j] * d_stage[n + j, c]
+                        substitute(M, right)
+                        d_slope[:n, c] = d_stage[n:, c]
+                        d_slope[n:, c] = right
                     share = 2.0 if stage in (1, 2) else 1.0
                     q_total += share * v_stage
                     v_total += share * slope

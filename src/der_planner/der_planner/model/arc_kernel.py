@@ -65,20 +65,25 @@ def arcs_and_slopes(z: Vector) -> Any:
     return arcs, slopes
 
 
-@njit(cache=True, nogil=True)
-def solve_symmetric(A: Vector, b: Vector) -> None:
-    """Solve A x = b for a positive definite A (n, n), of which the lower half is given.
+@njit(cache=True, nogil=True, inline="always")
+def factorise(A: Vector) -> None:
+    """Replace the lower half of a positive definite A (n, n) by its Cholesky factor.
 
-    b (n,) becomes x, A its Cholesky factor. For the few unknowns of a limb, calling LAPACK would
-    take longer than this.
+    For the few unknowns of a limb, calling LAPACK would take longer than this.
     """
-    n = b.size
-    for i in range(n):
+    for i in range(A.shape[0]):
         for k in range(i + 1):
             value = A[i, k]
             for m in range(k):
                 value -= A[i, m] * A[k, m]
             A[i, k] = np.sqrt(value) if i == k else value / A[k, k]
+
+
+@njit(cache=True, nogil=True, inline="always")
+def substitute(A: Vector, b: Vector) -> None:
+    """Replace b (n,) by the solution x of A x = b, with A as `factorise` left it."""
+    n = b.size
+    for i in range(n):
         value = b[i]
         for m in range(i):
             value -= A[i, m] * b[m]
