@@ -20,9 +20,10 @@ from der_planner.model import CONTROL_PERIOD
 REASONS = {
     "tags lost": "the limb has not been seen for {:.1f} s",
     "inconsistent": "the limb moves as the model cannot, measurements are {:.0f} times too far "
-    "off: is it this limb, and are they in rad, m and Pa, segment by segment from the clamp",
-    "swings": "corrections swing by {:.0f} Pa, what is slow in them is sent from now on: does the "
-    "limb swing as its file says? Calibrate it again",
+    "off: is it this limb, does something hold it, and are they in rad, m and Pa, segment by "
+    "segment from the clamp",
+    "swings": "corrections swing by {:.0f} Pa, what is slow in them is sent from now on: does "
+    "something touch the limb, or does it swing otherwise than its file says? Calibrate it again",
     "late": "commands come {:.2f} s after their instant",
     "pressures": "chambers are said to hold {:.3g} Pa, which no command has made: are pressures "
     "told in Pa, and is the supply open?",
