@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
-
 import pytest
 
-from der_planner.experiment.client import GraphClient
-from der_planner.experiment.console import Progress
-from der_planner.experiment.graph_run import RunningGraph, running_graph
-from der_planner.experiment.processes import GraphError, GraphSetup, NodeError
+from der_planner.experiment.processes import GraphError, NodeError
 
 pytestmark = pytest.mark.graph
 
@@ -27,22 +22,3 @@ def test_a_driver_without_its_board_ends_with_the_port_and_the_remedy(graph):
     with pytest.raises(NodeError, match=r"'pressure_driver' died \(exit code 1\)") as caught:
         graph.client.wait_ready(["pressure_driver"])
     assert port in str(caught.value)
-
-
-def test_a_second_graph_that_begins_meanwhile_is_named(graph, monkeypatch):
-    with contextlib.ExitStack() as others:
-
-        def start(running, specs, logs, remap):
-            for _ in range(2):
-                others.enter_context(GraphClient("board_emulator", domain_id=graph.domain_id))
-            graph.client.wait_for(
-                lambda: graph.client.count_nodes()["board_emulator"] == 2, 60.0, "both boards"
-            )
-
-        monkeypatch.setattr(RunningGraph, "start", start)
-        setup = GraphSetup(graph.folder / "bag", {})
-        with (
-            pytest.raises(GraphError, match=r"another graph is running .*'board_emulator'"),
-            running_graph(graph.client, setup, graph.folder, Progress()),
-        ):
-            raise AssertionError("it was recorded")

@@ -74,8 +74,6 @@ def running_graph(
         _refuse_second_graph(client, specs)
         try:
             graph.start(specs, logs, setup.rig.remap)
-            # A graph that was not seen at once, or that began meanwhile, is known by now.
-            _refuse_second_graph(client, specs, own=1)
             graph.bag = Path(client.call("recorder/start"))
             graph.check_clocks(bool((setup.planner or {}).get("feedback")))
             graph.arm()
@@ -91,13 +89,15 @@ def running_graph(
             raise process.failure("did not end in order")
 
 
-def _refuse_second_graph(client: GraphClient, specs: list[NodeSpec], own: int = 0) -> None:
-    """Raise `GraphError` if nodes of another graph are seen beside ``own`` of each name."""
+def _refuse_second_graph(client: GraphClient, specs: list[NodeSpec]) -> None:
+    """Raise `GraphError` if nodes of another graph are seen.
+
+    One that begins later, or is seen late, is found by the nodes, each of which looks for another
+    one of its name.
+    """
     count = client.count_nodes()
     # Of a node that somebody else starts there is one from the beginning.
-    others = [
-        spec.executable for spec in specs if count[spec.executable] > (1 if spec.host else own)
-    ]
+    others = [spec.executable for spec in specs if count[spec.executable] > bool(spec.host)]
     if others:
         raise GraphError(
             f"another graph is running in this ROS domain (node '{min(others)}'): stop it, or "
