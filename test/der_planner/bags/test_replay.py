@@ -13,12 +13,15 @@ from der_planner.commands.replay_bag import CLOCK_PERIOD, Selection, replay
 
 @pytest.fixture
 def bag(tmp_path: Path) -> Path:
-    writer = BagWriter(tmp_path / "run", split_seconds=1.0)
-    for index in range(20):
-        when = START + index * SECOND // 10
-        writer.write(spec("/a", TEXT), when, when, string(f"a{index}"))
-        writer.write(spec("/b", TEXT), when + 5, when, string(f"b{index}"))
-    return writer.close()
+    """Of two files and without metadata, as another recorder that was killed leaves it."""
+    for number in range(2):
+        writer = BagWriter(tmp_path / f"run_{number}")
+        for index in range(10 * number, 10 * number + 10):
+            when = START + index * SECOND // 10
+            writer.write(spec("/a", TEXT), when, when, string(f"a{index}"))
+            writer.write(spec("/b", TEXT), when + 5, when, string(f"b{index}"))
+        (writer.close() / f"run_{number}_0.mcap").rename(tmp_path / f"run_{number}.mcap")
+    return tmp_path
 
 
 def play(path: Path, **wanted):

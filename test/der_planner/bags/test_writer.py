@@ -78,29 +78,6 @@ def test_bytes_behind_the_content_are_no_damage_but_missing_ones_are(tmp_path: P
             next(messages)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("how", ["size", "time"])
-def test_split_repeats_latched_messages(tmp_path: Path, how: str):
-    options = {"split_bytes": 20_000} if how == "size" else {"split_seconds": 2.0}
-    bag = BagWriter(tmp_path / "run", compression="none", **options)
-    bag.write(spec("/plan", TEXT, latched=True), START, START, string("the plan"))
-    fill(bag, 60 if how == "time" else 900)
-    bag.close()
-    files = sorted((tmp_path / "run").glob("*.mcap"))
-    assert len(files) >= 3
-    for file in files:
-        with file.open("rb") as stream:
-            messages = list(make_reader(stream).iter_messages())
-        assert messages[0][1].topic == "/plan"
-        assert messages[0][2].data == string("the plan")
-        assert messages[0][2].publish_time == START
-    texts = read_texts(tmp_path / "run")
-    assert texts.count("the plan") == len(files)
-    assert [t for t in texts if t != "the plan"] == [
-        f"word {i}" for i in range(60 if how == "time" else 900)
-    ]
-
-
 def test_small_messages_do_not_share_chunks_with_large_ones(tmp_path: Path):
     bag = BagWriter(tmp_path / "run", compression="none")
     for index in range(60):

@@ -1,4 +1,4 @@
-"""Write a bag as rosbag2 lays it out: raw CDR in MCAP files with embedded definitions.
+"""Write a bag as rosbag2 lays it out: raw CDR in an MCAP file with embedded definitions.
 
 rosbag2's own writer keeps a chunk open until it is full; here every `flush` ends the chunk and
 hands it to the operating system, so a killed process leaves whole chunks. A bag whose writing was
@@ -13,7 +13,6 @@ import contextlib
 import shutil
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -43,22 +42,6 @@ class BagWriteError(OSError):
     """The bag cannot be written any further; the message says why and what is left of it."""
 
 
-@dataclass
-class FileSummary:
-    """What one file of the bag holds; times in ns, both 0 without messages."""
-
-    name: str
-    message_count: int = 0
-    first: int = 0
-    last: int = 0
-
-    def add(self, log_time: int) -> None:
-        """Count a message."""
-        self.first = log_time if self.message_count == 0 else min(self.first, log_time)
-        self.last = max(self.last, log_time)
-        self.message_count += 1
-
-
 class BagWriter:
     """A bag folder that is being written.
 
@@ -66,8 +49,6 @@ class BagWriter:
         folder: the bag; made here, must not exist yet or be empty.
         custom_data: strings kept in the bag and in ``metadata.yaml``.
         compression: of chunks: ``none``, ``lz4`` or ``zstd``.
-        split_bytes: begin a new file after this many bytes; 0 = never.
-        split_seconds: begin a new file after this recorded time [s]; 0 = never.
         minimum_free: close the bag when the disk has fewer free bytes; 0 = do not look.
 
     Raises:
@@ -81,26 +62,24 @@ class BagWriter:
         custom_data: Mapping[str, str] | None = None,
         *,
         compression: str = "zstd",
-        split_bytes: int = 0,
-        split_seconds: float = 0.0,
         minimum_free: int = 0,
     ) -> None:
         self.folder = Path(folder)
         self.custom_data = dict(custom_data or {})
         self._compression = COMPRESSIONS[compression]
-        self._split_bytes = split_bytes
-        self._split_time = round(split_seconds * 1e9)
         self._minimum_free = minimum_free
         self._topics: dict[str, TopicSpec] = {}
         self._counts: Counter[str] = Counter()
-        self._latched: dict[str, tuple[int, bytes]] = {}
-        self._files: list[FileSummary] = []
+        self._name = f"{self.folder.name}_0.mcap"
+        self._first, self._last = 0, 0
         self._small: list[tuple[TopicSpec, int, int, bytes]] = []
         self._small_bytes = 0
         self._sequences: dict[str, int] = {}
-        self._bytes_finished = 0
+        self._channels: dict[str, Channel] = {}
+        self._schemas: dict[str, Schema] = {}
+        self._repeats: dict[str, int] = {}
         self.byte_count = 0
-        """Bytes in all files; what waits for the next flush is not counted."""
+        """Bytes in the file; what waits for the next flush is not counted."""
         self._closed = False
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
@@ -116,13 +95,8 @@ class BagWriter:
 
     @property
     def message_count(self) -> int:
-        """Messages written, repeated latched ones included."""
+        """Messages written."""
         return self._counts.total()
-
-    @property
-    def file_count(self) -> int:
-        """Number of files of the bag."""
-        return len(self._files)
 
     def write(self, spec: TopicSpec, log_time: int, publish_time: int, data: bytes) -> None:
         """Append one message.
@@ -137,14 +111,18 @@ class BagWriter:
             BagWriteError: the storage refused; the bag stays as it is, without an index.
         """
         spec = self._topics.setdefault(spec.name, spec)
-        if spec.latched:
-            self._latched[spec.name] = (publish_time, data)
-        if self._is_full(log_time):
-            self._split(log_time)
-            if spec.latched:
-                return  # just written as the repeated message of the new file
+        self._first = min(self._first, log_time) if self._counts else log_time
+        self._last = max(self._last, log_time)
+        self._counts[spec.name] += 1
         with self._guarded():
-            self._append(spec, log_time, publish_time, data)
+            if len(data) >= LARGE:
+                self._emit(spec, log_time, publish_time, data)
+                self._end_chunk()
+                return
+            self._small.append((spec, log_time, publish_time, data))
+            self._small_bytes += len(data)
+            if self._small_bytes >= CHUNK_SIZE:
+                self._emit_small()
 
     def flush(self) -> None:
         """End the chunk and hand everything to the operating system.
@@ -156,7 +134,7 @@ class BagWriter:
         with self._guarded():
             self._emit_small()
             self._repeat_definitions()
-        if not (self.folder / self._files[-1].name).exists():
+        if not (self.folder / self._name).exists():
             self._abandon()
             raise BagWriteError(
                 f"the bag {self.folder} was removed while it was recorded: what it held is lost"
@@ -176,51 +154,21 @@ class BagWriter:
         """
         if not self._closed:
             with self._guarded():
-                self._finish_file()
+                self._emit_small()
+                self._writer.finish()
+                self.byte_count = self._file.tell()
+                self._file.close()
                 self._write_metadata()
             self._closed = True
         return self.folder
 
-    def _is_full(self, log_time: int) -> bool:
-        present = self._files[-1]
-        if present.message_count == 0:
-            return False
-        by_size = 0 < self._split_bytes <= self._file.tell()
-        by_time = 0 < self._split_time <= log_time - present.first
-        return by_size or by_time
-
-    def _split(self, log_time: int) -> None:
-        """Finish the present file and begin the next with the latched messages."""
-        with self._guarded():
-            self._finish_file()
-            self._open_file()
-            for topic, (publish_time, data) in self._latched.items():
-                self._append(self._topics[topic], log_time, publish_time, data)
-
     def _open_file(self) -> None:
-        name = f"{self.folder.name}_{len(self._files)}.mcap"
-        self._file = (self.folder / name).open("xb")
+        self._file = (self.folder / self._name).open("xb")
         self._writer = Writer(self._file, chunk_size=CHUNK_SIZE, compression=self._compression)
-        self._files.append(FileSummary(name))
-        self._channels: dict[str, Channel] = {}
-        self._schemas: dict[str, Schema] = {}
-        self._repeats: dict[str, int] = {}
         self._writer.start(profile=PROFILE, library=LIBRARY)
         if self.custom_data:
             self._writer.add_metadata(RUN_KEY, self.custom_data)
         self._file.flush()
-
-    def _append(self, spec: TopicSpec, log_time: int, publish_time: int, data: bytes) -> None:
-        self._files[-1].add(log_time)
-        self._counts[spec.name] += 1
-        if len(data) >= LARGE:
-            self._emit(spec, log_time, publish_time, data)
-            self._end_chunk()
-            return
-        self._small.append((spec, log_time, publish_time, data))
-        self._small_bytes += len(data)
-        if self._small_bytes >= CHUNK_SIZE:
-            self._emit_small()
 
     def _emit_small(self) -> None:
         """Write the small messages that wait, as one chunk."""
@@ -232,7 +180,7 @@ class BagWriter:
 
     def _end_chunk(self) -> None:
         self._writer.flush()
-        self.byte_count = self._bytes_finished + self._file.tell()
+        self.byte_count = self._file.tell()
 
     def _emit(self, spec: TopicSpec, log_time: int, publish_time: int, data: bytes) -> None:
         if spec.name not in self._channels:
@@ -272,12 +220,6 @@ class BagWriter:
         self._end_chunk()
         self._repeats = {name: left - 1 for name, left in self._repeats.items() if left > 1}
 
-    def _finish_file(self) -> None:
-        self._emit_small()
-        self._writer.finish()
-        self.byte_count = self._bytes_finished = self._bytes_finished + self._file.tell()
-        self._file.close()
-
     @contextlib.contextmanager
     def _guarded(self) -> Iterator[None]:
         """Turn a refused write into a BagWriteError."""
@@ -310,15 +252,15 @@ class BagWriter:
         unfinished.replace(self.folder / METADATA_FILE)
 
     def _metadata(self) -> dict[str, Any]:
-        filled = [entry for entry in self._files if entry.message_count]
-        first = min((entry.first for entry in filled), default=0)
-        last = max((entry.last for entry in filled), default=0)
+        content = {
+            "duration": {"nanoseconds": self._last - self._first},
+            "starting_time": {"nanoseconds_since_epoch": self._first},
+            "message_count": self.message_count,
+        }
         return {
             "version": 9,
             "storage_identifier": "mcap",
-            "duration": {"nanoseconds": last - first},
-            "starting_time": {"nanoseconds_since_epoch": first},
-            "message_count": self.message_count,
+            **content,
             "topics_with_message_count": [
                 {
                     "topic_metadata": {
@@ -334,16 +276,8 @@ class BagWriter:
             ],
             "compression_format": "",
             "compression_mode": "",
-            "relative_file_paths": [entry.name for entry in self._files],
-            "files": [
-                {
-                    "path": entry.name,
-                    "starting_time": {"nanoseconds_since_epoch": entry.first},
-                    "duration": {"nanoseconds": entry.last - entry.first},
-                    "message_count": entry.message_count,
-                }
-                for entry in self._files
-            ],
+            "relative_file_paths": [self._name],
+            "files": [{"path": self._name, **content}],
             "custom_data": self.custom_data,
             "ros_distro": "jazzy",
         }

@@ -121,8 +121,6 @@ class Recorder(Node):
             "of the bag's chunks; auto: none with images, else zstd",
             choices=("auto", *COMPRESSIONS),
         )
-        declare("split_size", 0, "begin a new file after so many bytes; 0: never", at_least=0)
-        declare("split_duration", 0.0, "begin a new file after so many s; 0: never", at_least=0.0)
         declare("flush_interval", 1.0, "time between flushes [s]", at_least=0.05, at_most=60.0)
         declare("queue_size", 256 << 20, "bytes that may wait for the disk", at_least=1 << 20)
         declare("minimum_free", 64 << 20, "stop below so many free bytes; 0: never", at_least=0)
@@ -236,8 +234,6 @@ class Recorder(Node):
             folder.absolute(),
             {RUN_KEY: metadata},
             compression=compression,
-            split_bytes=self._parameter("split_size"),
-            split_seconds=self._parameter("split_duration"),
             minimum_free=self._parameter("minimum_free"),
         )
         self._session = RecordingSession(
@@ -345,7 +341,6 @@ class Recorder(Node):
             "bag": bag.folder,
             "recorded": bag.message_count,
             "bytes": bag.byte_count,
-            "files": bag.file_count,
             "dropped": session.dropped,
             "queued_bytes": session.queued_bytes,
         }
