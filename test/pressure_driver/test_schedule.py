@@ -22,64 +22,52 @@ def offer(schedule, item, now=NOW):
 def test_a_setpoint_waits_for_its_stamp_and_is_then_held():
     schedule = SetpointSchedule(Settings())
     assert offer(schedule, setpoint(3)) is Verdict.ACCEPTED
-    assert [schedule.sample(NOW + k * PERIOD) for k in (1, 2)] == [None, None]
-    first = schedule.sample(NOW + 3 * PERIOD)
-    assert first.fresh
-    assert first.differential == (1000.0, -1000.0)
-    held = schedule.sample(NOW + 4 * PERIOD)
-    assert not held.fresh
-    assert held.differential == first.differential
+    assert [schedule.take(NOW + k * PERIOD) for k in (1, 2)] == [None, None]
+    assert schedule.take(NOW + 3 * PERIOD).differential == (1000.0, -1000.0)
+    assert schedule.take(NOW + 4 * PERIOD) is None
+    assert schedule.current.differential == (1000.0, -1000.0)
     assert schedule.counts["executed"] == 1
 
 
 def test_a_stamp_between_ticks_takes_effect_at_the_next_one():
     schedule = SetpointSchedule(Settings())
     offer(schedule, setpoint(2, offset=1))
-    assert schedule.sample(NOW + 2 * PERIOD) is None
-    assert schedule.sample(NOW + 3 * PERIOD).fresh
+    assert schedule.take(NOW + 2 * PERIOD) is None
+    assert schedule.take(NOW + 3 * PERIOD)
 
 
 def test_two_setpoints_within_one_tick_leave_the_later_one():
     schedule = SetpointSchedule(Settings())
     offer(schedule, setpoint(2, 1000.0, offset=-2 * 10**7))
     offer(schedule, setpoint(2, 2000.0, index=1))
-    assert schedule.sample(NOW + 2 * PERIOD).differential[0] == 2000.0
+    assert schedule.take(NOW + 2 * PERIOD).differential[0] == 2000.0
     assert schedule.counts["superseded"] == 1
-
-
-def test_linear_interpolation_moves_between_stamps():
-    schedule = SetpointSchedule(Settings(interpolation="linear"))
-    offer(schedule, setpoint(2, 0.0))
-    offer(schedule, setpoint(6, 4000.0, index=1))
-    samples = [schedule.sample(NOW + k * PERIOD) for k in range(2, 8)]
-    assert [s.differential[0] for s in samples] == [0.0, 1000.0, 2000.0, 3000.0, 4000.0, 4000.0]
-    assert [s.fresh for s in samples] == [True] * 5 + [False]
 
 
 def test_stamp_zero_is_the_next_tick():
     schedule = SetpointSchedule(Settings())
-    schedule.sample(NOW)
+    schedule.take(NOW)
     item = Setpoint(0, (500.0, 0.0))
     assert offer(schedule, item, NOW + 10**6) is Verdict.ACCEPTED
-    assert schedule.sample(NOW + PERIOD).differential == (500.0, 0.0)
+    assert schedule.take(NOW + PERIOD).differential == (500.0, 0.0)
     # Even if the next tick has been taken while the message was under way.
-    schedule.sample(NOW + 2 * PERIOD)
+    schedule.take(NOW + 2 * PERIOD)
     assert offer(schedule, item, NOW + PERIOD) is Verdict.ACCEPTED
-    assert schedule.sample(NOW + 3 * PERIOD).fresh
+    assert schedule.take(NOW + 3 * PERIOD)
 
 
 def test_of_two_untimed_commands_within_a_tick_the_newer_one_counts():
     schedule = SetpointSchedule(Settings())
-    schedule.sample(NOW)
+    schedule.take(NOW)
     for value in (500.0, 700.0):
         assert offer(schedule, Setpoint(0, (value, 0.0)), NOW + 10**6) is Verdict.ACCEPTED
-    assert schedule.sample(NOW + PERIOD).differential == (700.0, 0.0)
+    assert schedule.take(NOW + PERIOD).differential == (700.0, 0.0)
     assert schedule.counts["superseded"] == 1
 
 
 def test_late_ones_are_counted_and_refused():
     schedule = SetpointSchedule(Settings())
-    schedule.sample(NOW + 4 * PERIOD)
+    schedule.take(NOW + 4 * PERIOD)
     assert offer(schedule, setpoint(4), NOW + 4 * PERIOD) is Verdict.LATE
     assert offer(schedule, setpoint(3, offset=1), NOW + 4 * PERIOD) is Verdict.LATE
     assert offer(schedule, setpoint(5), NOW + 4 * PERIOD) is Verdict.ACCEPTED
@@ -98,7 +86,7 @@ def test_a_new_plan_replaces_the_old_from_its_first_stamp_on():
     assert "replaced" in schedule.reason
     plans = []
     for k in range(1, 10):
-        schedule.sample(NOW + k * PERIOD)
+        schedule.take(NOW + k * PERIOD)
         plans.append(schedule.current.plan_id)
     assert plans == ["a"] * 4 + ["b"] * 5
 
@@ -121,7 +109,7 @@ def test_refused_with_the_reason(values, reason):
     assert reason in schedule.reason
     assert "setpoint 3 of 'plan-7'" in schedule.reason
     assert schedule.waiting == 0
-    assert schedule.sample(NOW + PERIOD) is None
+    assert schedule.take(NOW + PERIOD) is None
 
 
 def test_too_far_ahead_is_refused():
@@ -139,11 +127,11 @@ def test_slew_is_taken_between_neighbours_in_time():
     # Fits behind its predecessor, but the way to the next would be too steep.
     assert offer(schedule, setpoint(6, 2900.0)) is Verdict.REFUSED
     assert offer(schedule, setpoint(6, 3000.0)) is Verdict.ACCEPTED
-    assert schedule.sample(NOW + PERIOD).fresh
+    assert schedule.take(NOW + PERIOD)
     # What is held counts, not how long it has been held.
     fresh = SetpointSchedule(limits)
     fresh.offer(setpoint(1, 500.0), NOW, ZERO)
-    fresh.sample(NOW + PERIOD)
+    fresh.take(NOW + PERIOD)
     late = setpoint(101, 5000.0)
     assert fresh.offer(late, NOW + 99 * PERIOD, (500.0, -500.0)) is Verdict.REFUSED
 

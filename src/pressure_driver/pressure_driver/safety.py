@@ -26,7 +26,6 @@ from pressure_driver.schedule import (
     NANOSECONDS,
     Origin,
     PublisherGate,
-    Sample,
     Setpoint,
     SetpointSchedule,
     SpentPlans,
@@ -240,25 +239,25 @@ class SafetyMachine:
         """
         if lost := self.leases.ended(now):
             self._lose_operator(", ".join(lost), now)
-        sample = self.schedule.sample(tick, self.differential)
+        due = self.schedule.take(tick)
         self._look_for_faults(now)
         if self.mode in (Mode.DISARMED, Mode.FAULT):
             self.command_nothing()
         elif self._latched:
             self._finish_vent(now)
         else:
-            self._follow(sample, now)
+            self._follow(due, now)
             return self.mode is Mode.ARMED
         return True
 
-    def _follow(self, sample: Sample | None, now: float) -> None:
+    def _follow(self, due: Setpoint | None, now: float) -> None:
         """Move between ARMED, TRACKING, HOLDING and VENTING, and set what is commanded.
 
         How long setpoints have been missing is taken on the steady clock: a wall clock that is set
         back must not keep a limb under pressure.
         """
-        if sample is not None and sample.fresh:
-            self._target = sample.differential
+        if due is not None:
+            self._target = due.differential
             self._fresh_at = now
             self.mode = Mode.TRACKING
         if self.mode is Mode.TRACKING:

@@ -52,17 +52,8 @@ class Setpoint:
     """Replaces a lower one of the same plan, index and stamp."""
 
 
-class Sample(NamedTuple):
-    """What the schedule asks for at one tick."""
-
-    differential: tuple[float, ...]
-    """(M,) [Pa] the pressures of the setpoint in force, or interpolated toward the next."""
-    fresh: bool
-    """The setpoint came into force at this tick, or the value moves toward the next."""
-
-
 class SetpointSchedule:
-    """A buffer of timed setpoints with zero-order hold or linear interpolation.
+    """A buffer of timed setpoints, each in force until the next.
 
     Args:
         settings: the ticks, and what every setpoint is checked against.
@@ -199,40 +190,21 @@ class SetpointSchedule:
         """Return the first tick at or after a stamp."""
         return -(-stamp // self.period) * self.period
 
-    def sample(self, tick: int, held: Sequence[float] = ()) -> Sample | None:
-        """Bring into force what is due at a tick.
+    def take(self, tick: int) -> Setpoint | None:
+        """Bring into force what is due at a tick, and return it.
 
         Args:
             tick: [ns]; ticks must not go backward (see `forget_ticks`).
-            held: (M,) [Pa] what was commanded at the last tick. Interpolation goes on from there,
-                so that pressures which were let down or limited meanwhile do not come back at
-                once. Empty: the last setpoint's.
-
-        Returns:
-            What to command, or None before the first setpoint.
         """
         self._last_tick = max(self._last_tick, tick)
         due = bisect.bisect_right(self._waiting, tick, key=lambda item: item.stamp)
-        if due:
-            self.current = self._waiting[due - 1]
-            del self._waiting[:due]
-            self.counts["executed"] += 1
-            self.counts["superseded"] += due - 1
-        current = self.current
-        if current is None:
+        if not due:
             return None
-        if self.settings.interpolation == "hold" or not self._waiting:
-            return Sample(current.differential, fresh=bool(due))
-        if due or not held:
-            begin, start = current.stamp, current.differential
-        else:
-            begin, start = tick - self.period, tuple(held)
-        following = self._waiting[0]
-        share = (tick - begin) / (following.stamp - begin)
-        moved = tuple(
-            a + share * (b - a) for a, b in zip(start, following.differential, strict=True)
-        )
-        return Sample(moved, fresh=True)
+        self.current = self._waiting[due - 1]
+        del self._waiting[:due]
+        self.counts["executed"] += 1
+        self.counts["superseded"] += due - 1
+        return self.current
 
     def forget_ticks(self) -> None:
         """Accept earlier stamps again, as after the wall clock was set back."""

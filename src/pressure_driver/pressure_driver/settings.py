@@ -88,7 +88,6 @@ class Settings:
     atmosphere: float = _number(
         0.0, "Pa", 0.0, 1.1e5, "absolute, of the room; 0: measured with vented chambers"
     )
-    interpolation: str = _other("hold", "between setpoints", ("hold", "linear"))
     horizon: float = _number(10.0, "s", 0.1, 3600.0, "a setpoint's stamp may lie ahead")
     accept_cmd_u_t: bool = _other(
         False, "also take std_msgs/Float64MultiArray in hPa on cmd_u_t, in force at once"
