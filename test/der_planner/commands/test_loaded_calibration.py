@@ -37,7 +37,7 @@ def table(tmp_path_factory):
 def test_mounting_stays_in_the_limb_file_and_payload_does_not(table, monkeypatch, capsys):
     out = table / "limb.yaml"
     loads = ("--payload", 0.05, "--payload-at", 0.2)
-    given = ("--csv", table / "log.csv", "--columns", table / "columns.yaml", "--terms", "friction")
+    given = (table / "log.csv", "--columns", table / "columns.yaml", "--terms", "friction")
     status = run(
         calibrate_limb, *given, "--mounting", "hanging", *loads, "--out", out,
         monkeypatch=monkeypatch,
@@ -57,7 +57,7 @@ def test_what_a_scale_shows_sets_the_scale_of_the_limb_file(table, monkeypatch, 
     """Stiffness and gain follow the mass; a log of shapes and pressures shows their ratios only."""
     rows = (table / "log.csv").read_text().splitlines()
     (table / "short.csv").write_text("\n".join(rows[: 20 * 14]))
-    given = ("--csv", table / "short.csv", "--columns", table / "columns.yaml")
+    given = (table / "short.csv", "--columns", table / "columns.yaml")
     given += ("--terms", "dynamics")
     given += ("--mounting", "hanging", "--payload", 0.05, "--payload-at", 0.2)
     heavier = 1.15 * Limb.default().mass
@@ -79,7 +79,7 @@ def test_what_a_scale_shows_sets_the_scale_of_the_limb_file(table, monkeypatch, 
 
 
 def test_loads_that_cannot_be_are_refused(table, monkeypatch, capsys):
-    given = ("--csv", table / "log.csv", "--columns", table / "columns.yaml")
+    given = (table / "log.csv", "--columns", table / "columns.yaml")
     for wrong, reason in (
         (("--mounting", "upside"), "mounting 'upside' is unknown"),
         (("--payload", 0.05, "--payload-at", 0.7), "at most the limb's length"),

@@ -46,7 +46,7 @@ def call(monkeypatch, capsys, tmp_path):
         ("der_planner.commands.calibrate_limb", ["--excitation", "BUSY"], 2, "no folder"),
         (
             "der_planner.commands.calibrate_limb",
-            [*STANDING, "--csv", "/none.csv", "--columns", "/none.yaml"],
+            [*STANDING, "/none.csv", "--columns", "/none.yaml"],
             1,
             "which neither rod nor arcs predict. Hang it",
         ),

@@ -3,14 +3,15 @@
     python3 scripts/calibrate_limb.py --offline --seed 3 --out my_twin.yaml
     python3 scripts/calibrate_limb.py --graph --seed 3 --out my_twin.yaml
     python3 scripts/calibrate_limb.py --graph --hardware my_rig.yaml --out my_limb.yaml
-    python3 scripts/calibrate_limb.py --bag calibrations/DATE/bag --out my_limb.yaml
-    python3 scripts/calibrate_limb.py --csv log.csv --columns map.yaml --mass 0.31 --out limb.yaml
+    python3 scripts/calibrate_limb.py calibrations/DATE/bag --out my_limb.yaml
+    python3 scripts/calibrate_limb.py log.csv --columns map.yaml --mass 0.31 --out limb.yaml
     python3 scripts/calibrate_limb.py their_log.csv --out limb.yaml
 
 --offline plays the calibration on the twin in one process, in seconds. --graph plays it in real
 time on the running graph, on the twin or the hardware, records a bag, vents, and fits to the bag:
-about four minutes. A bag is any recorded run that excites every input; `--excitation FILE.csv`
-writes the pressures of the calibration run, and `--play FILE.csv` plays such a file instead.
+about four minutes. A log is a table or a bag of any run that excites every input; its last quarter
+is kept back to judge the fit, unless there is --held-out or --weight. `--excitation FILE.csv` writes
+the pressures of the calibration run, and `--play FILE.csv` plays such a file instead.
 
 --mounting says how the limb was mounted in the log, --payload what it carried beside its own
 masses: the payload belongs to the log and does not enter the limb file. --mass is what a scale
@@ -114,7 +115,7 @@ def _main(given: argparse.Namespace) -> int:
         )
     log = _obtain(prior, given)
     kept_back = []
-    if given.log is not None:
+    if given.log is not None and not given.held_out and given.weight is None:
         log, rest = log.parted(LAST_PART)
         kept_back = [dataclasses.replace(rest, source=f"the end of {rest.source}, not shown")]
     limb, report = _fit(prior, log, loads, given)
@@ -140,7 +141,6 @@ def _parser() -> argparse.ArgumentParser:
     source.add_argument(
         "--graph", action="store_true", help="play on the running graph, record a bag and fit to it"
     )
-    source.add_argument("--bag", type=Path, help="fit to a recorded run")
     source.add_argument(
         "log",
         type=Path,
@@ -148,7 +148,6 @@ def _parser() -> argparse.ArgumentParser:
         metavar="LOG",
         help="fit to a log of any program, a table or a bag; what cannot be known is asked once",
     )
-    source.add_argument("--csv", type=Path, help="fit to a table; needs --columns")
     source.add_argument(
         "--excitation", type=Path, metavar="FILE", help="write the run's pressures as CSV and stop"
     )
@@ -216,7 +215,6 @@ def _check(given: argparse.Namespace) -> None:
         OptionError: names the option and what it may be.
     """
     for wrong, said in (
-        (given.csv and not given.columns, "--csv needs --columns FILE"),
         (given.weight == 0.0, "--weight is 0 kg: give what the weight weighs"),
         (given.hardware and not given.graph, "--hardware goes with --graph"),
         (given.folder and not given.graph, "--folder goes with --graph"),
@@ -226,7 +224,7 @@ def _check(given: argparse.Namespace) -> None:
         ),
         (
             given.weight is not None and given.offline,
-            "--weight goes with --graph or --csv: nobody hangs a weight on the offline twin",
+            "--weight goes with --graph or a LOG: nobody hangs a weight on the offline twin",
         ),
         (not 0 <= given.seed < 2**31, f"--seed is {given.seed}: choose 0 to {2**31 - 1}"),
         (
@@ -312,7 +310,7 @@ def _obtain(prior: Limb, given: argparse.Namespace) -> CalibrationLog:
         source = log.source if given.hardware else f"twin, seed {given.seed}, bag"
         return dataclasses.replace(log, source=source)
     if not given.offline:
-        return read_log(given.log or given.bag or given.csv, _columns(given), given.namespace)
+        return read_log(given.log, _columns(given), given.namespace)
     limit = prior.pneumatics.pressure_limit
     run = within_limits(_excitation(prior, limit, given), limit, math.inf)
     print(f"playing {run.duration:.0f} s on the twin of seed {given.seed} …", file=sys.stderr)
@@ -320,13 +318,13 @@ def _obtain(prior: Limb, given: argparse.Namespace) -> CalibrationLog:
 
 
 def _columns(given: argparse.Namespace) -> Path | None:
-    """Return the map of the log's columns; of a LOG without one, ask for it and keep it.
+    """Return the map of the log's columns; where there is none yet, ask for it and keep it.
 
     Raises:
         LogError: the log cannot be read, or there is nobody to ask.
     """
-    if given.columns is not None or given.log is None:
-        return Path(given.columns) if given.columns else None
+    if given.columns is not None:
+        return Path(given.columns)
     path = Path(f"{given.log}.columns.yaml")
     if path.exists():
         return path
