@@ -56,6 +56,16 @@ def test_windows_agree_with_one_window():
     assert np.abs(whole.commands - windows.commands).max() < 60.0
 
 
+@pytest.mark.parametrize(("name", "period"), [("asynchronous", 6.0), ("opposite_direction", 3.0)])
+def test_the_optimum_is_found_in_few_steps_whatever_the_dead_time(name, period):
+    """The linearisation must know the delay: without, the plan takes 12 steps and misses more."""
+    air = replace(LIMB.pneumatics, slew_limit=1e6, pressure_limit=1e5, delay=0.12)
+    solver = solver_for(replace(LIMB, pneumatics=air), Motion.named(name, 0.6, period, 1))
+    found = solver.run()
+    assert found.steps <= 4
+    assert np.linalg.norm(found.tip[1:] - solver.target[:-1], axis=1).mean() < 3e-5
+
+
 def test_nothing_within_the_limits_is_better_than_the_limited_programme():
     rng = np.random.default_rng(2)
     size, inputs = 8, 2

@@ -171,7 +171,7 @@ def test_optimal_uses_what_the_limits_leave_better_than_cutting():
     cut = plan(LIMB, motion, "der", "projected")
     best = plan(LIMB, motion, "der", "optimal")
     assert best.predicted_error < 0.25 * cut.predicted_error
-    assert best.details["limited_windows"] > 0
+    assert best.slew_margin < 1e-3
     slow = Motion.named("same_direction", period=3.0, cycles=1)
     warnings = plan(LIMB, slow, "der", "optimal").warnings
     assert any("the limits leave a mean error of" in warning for warning in warnings)
@@ -275,12 +275,3 @@ def test_cancelling_by_progress_ends_the_planning():
 
     with pytest.raises(StopError):
         plan(LIMB, Motion.named("asynchronous"), "der", "optimal", progress=progress)
-
-
-@pytest.mark.parametrize(("name", "period"), [("asynchronous", 6.0), ("opposite_direction", 3.0)])
-def test_the_optimum_is_found_in_few_steps_whatever_the_dead_time(name, period):
-    """The linearisation must know the delay: without, the plan takes 12 steps and misses more."""
-    late = changed(LIMB, {"slew_limit": 1e6, "pressure_limit": 1e5, "delay": 0.12})
-    result = plan(late, Motion.named(name, 0.6, period, 1), "der", "optimal")
-    assert result.details["steps"] <= 4
-    assert result.predicted_error < 3e-5

@@ -162,7 +162,6 @@ class Correction:
             tip_predicted=tip + disturbance,
             method=LEARNED,
             solve_time=clock.perf_counter() - started,
-            details=best.details,
         )
 
     def _solve(self, commands: Array, wanted: Array, pull: float, begin: Array) -> Optimum:

@@ -86,11 +86,6 @@ class Optimum:
     steps: int
     limited: int
 
-    @property
-    def details(self) -> dict[str, float]:
-        """Numbers for a plan's `details`."""
-        return {"steps": self.steps, "limited_windows": self.limited}
-
 
 class Optimiser:
     """Solves window after window; see the module.

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +49,6 @@ class Plan:
         body: the model of the limb that it was made for.
         solve_time: wall time of the planning [s].
         warnings: sentences: limits that cut the wanted pressures, ranges that were left.
-        details: numbers of the method: iterations, cost, Newton steps.
         chambers_beyond: (K, M) by how much the chambers held more than their model in the last run
             that a learned plan is from, mean of each period [Pa]; None: nobody told.
     """
@@ -68,7 +67,6 @@ class Plan:
     body: Model
     solve_time: float
     warnings: tuple[str, ...] = ()
-    details: dict[str, float] = field(default_factory=dict)
     chambers_beyond: Array | None = None
 
     @property

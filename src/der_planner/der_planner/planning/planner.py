@@ -138,7 +138,6 @@ def plan(
         body=body,
         solve_time=clock.perf_counter() - begin,
         warnings=tuple(filter(None, said)),
-        details=found.details if method == "optimal" else {},
     )
 
 
