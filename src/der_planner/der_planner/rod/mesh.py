@@ -205,19 +205,16 @@ def voronoi_lengths(rest: Array, ghost: bool) -> Array:
     return cells
 
 
-def limb_mesh(limb: Limb, nodes: int, clamp: str) -> Mesh:
+def limb_mesh(limb: Limb, nodes: int) -> Mesh:
     """Return the mesh of `Rod.from_limb`; see there for the arguments."""
     least = 3 * limb.segment_count
     require(isinstance(nodes, (int, np.integer)) and nodes >= least, "nodes",
             f"an int of {least} or more for {limb.segment_count} segments", nodes)  # fmt: skip
     owner, rest, pairs = _segment_edges(limb, nodes)
-    ghost = clamp == "ghost"
     # What bends at a node is half of each edge beside it; a rigid connector does not bend.
     half = np.where((owner < 0) & (limb.connector_length > 0.0), 0.0, 0.5 * rest)
     before, after = np.append(0.0, half), np.append(half, 0.0)
     before[-1] = after[-1] = 0.0
-    if not ghost:
-        after[0] = 0.0
     # The segments behind and ahead of each edge: the same one unless it is a connector.
     behind, ahead = (np.where(owner < 0, np.roll(owner, by), owner) for by in (1, -1))
 
@@ -256,8 +253,8 @@ def limb_mesh(limb: Limb, nodes: int, clamp: str) -> Mesh:
         rest_kappa=rest_kappa,
         rest_twist=np.zeros(nodes),
         gravity=np.array(limb.gravity, dtype=float),
-        ghost=ghost,
-        clamped=clamped_indices(clamp, (), nodes),
+        ghost=True,
+        clamped=clamped_indices("ghost", (), nodes),
         segments=pairs,
         gain=gain,
         point_mass=masses_on_nodes(

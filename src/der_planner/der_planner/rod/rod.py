@@ -167,7 +167,6 @@ class Rod:
         limb: Limb,
         nodes: int = 21,
         *,
-        clamp: Literal["ghost", "inside"] = "ghost",
         plane: Plane | Literal["auto"] | None = "auto",
     ) -> Rod:
         """Build the rod of a limb. "auto" is planar ("xy") unless gravity leaves the plane.
@@ -179,7 +178,7 @@ class Rod:
         """
         if plane == "auto":
             plane = "xy" if limb.gravity[2] == 0.0 else None
-        return cls(limb_mesh(limb, nodes, clamp), plane)
+        return cls(limb_mesh(limb, nodes), plane)
 
     def warm_up(self) -> None:
         """Compile, or load from the cache, every kernel that this rod will call."""
