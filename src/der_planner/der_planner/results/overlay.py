@@ -228,15 +228,13 @@ def _points(points: Sequence[Any]) -> Array:
 
 def gray(image: Any) -> Picture | None:
     """Return an image message as (H, W) gray values, None for an encoding that is not known."""
-    data = np.frombuffer(bytes(image.data), dtype=np.uint8)
-    rows = data.reshape(image.height, image.step)
-    if image.encoding in ("mono8", "8UC1"):
-        return rows[:, : image.width]
-    if image.encoding in ("bgr8", "rgb8"):
-        colours = rows[:, : 3 * image.width].reshape(image.height, image.width, 3)
-        code = cv2.COLOR_BGR2GRAY if image.encoding == "bgr8" else cv2.COLOR_RGB2GRAY
-        return np.asarray(cv2.cvtColor(colours, code), dtype=np.uint8)
-    return None
+    # Only who looks at pictures needs the tracker.
+    from apriltag_tracker.camera.images import ImageError, ImageReader  # noqa: PLC0415
+
+    try:
+        return ImageReader().to_grey(image)
+    except ImageError:
+        return None
 
 
 def plot_shapes(runs: Sequence[RunSeries], folder: Path) -> list[Path]:
