@@ -20,6 +20,7 @@ from der_planner.results import (
     write_report,
 )
 from der_planner.results.overlay import RunImages, plot_shapes, write_video
+from der_planner.results.report import document
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +63,7 @@ def test_report_is_one_page_with_everything_in_it(bag: Path, tmp_path: Path):
     run = load_run(bag)
     other = series(reference(FRAMES) + np.array([0.0, 0.01]), model="pcc", trial=1, seed=1)
     results = [evaluate_run(run), evaluate_run(other)]
-    written = write_report([run, other], results, tmp_path, title="Errors <of a lab>")
+    written = write_report([run, other], results, tmp_path)
     names = {path.name for path in tmp_path.iterdir()}
     assert names >= {"results.json", "table.md", "table.csv", "table.tex", "report.html"}
     assert names >= {f"{n}.{e}" for n in ("tip", "error", "shapes") for e in ("png", "pdf")}
@@ -71,7 +72,7 @@ def test_report_is_one_page_with_everything_in_it(bag: Path, tmp_path: Path):
     assert sources
     assert all(source.startswith("data:image/png;base64,") for source in sources)
     assert "url(" not in page
-    assert "Errors &lt;of a lab&gt;" in page
+    assert "Errors &lt;of a lab&gt;" in document("Errors <of a lab>", [])
     assert "c0ffee" in page
     (found,) = compare(results)
     assert f"{found.difference_m * 100:.2f} cm less error" in page

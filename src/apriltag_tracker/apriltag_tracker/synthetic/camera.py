@@ -42,7 +42,6 @@ class Optics:
         exposure: time a picture takes [s]; motion during it blurs.
         black: grey level of printed black in nominal light.
         white: grey level of paper in nominal light.
-        floor: grey level of the base plane.
         light_fall: by how much the light differs over the picture, as a share of its mean.
     """
 
@@ -51,7 +50,6 @@ class Optics:
     exposure: float = 0.004
     black: float = 28.0
     white: float = 205.0
-    floor: float = 120.0
     light_fall: float = 0.25
 
 
@@ -291,7 +289,7 @@ class SyntheticCamera:
         clouds = cv2.resize(
             coarse.astype(np.float32), (size.width, size.height), interpolation=cv2.INTER_CUBIC
         )
-        floor = (self.optics.floor + 6.0 * clouds) * self._eye.light
+        floor = (120.0 + 6.0 * clouds) * self._eye.light
         image: NDArray[Any] = np.clip(np.round(floor), 0, 255).astype(np.uint8)
         if not len(world):
             return image, {}

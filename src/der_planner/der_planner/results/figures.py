@@ -201,14 +201,14 @@ def plot_error(runs: Sequence[RunSeries], folder: Path) -> list[Path]:
         return save(figure, folder, "error")
 
 
-def mean_error(runs: Sequence[RunSeries], rate: float = 20.0) -> tuple[Array, Array, Array]:
+def mean_error(runs: Sequence[RunSeries]) -> tuple[Array, Array, Array]:
     """Return time, mean and standard deviation of |r − r̄| over runs on a common grid [s, m, m].
 
     A gap in one run does not count there: at each instant the mean is over the runs that have a
     valid image within 0.1 s. The deviation is 0 where only one has.
     """
     last = min(float(run.reference.time[-1]) for run in runs)
-    grid = np.arange(0.0, last, 1.0 / rate)
+    grid = np.arange(0.0, last, 0.05)
     rows = np.full((len(runs), len(grid)), np.nan)
     for row, run in zip(rows, runs, strict=True):
         series = error_series(run)

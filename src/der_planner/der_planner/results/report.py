@@ -71,7 +71,6 @@ def write_report(
     results: Sequence[RunResult],
     folder: Path,
     *,
-    title: str = "Tracking errors",
     progress: Callable[[str], None] = lambda _: None,
 ) -> Path:
     """Write page, tables and figures into a folder.
@@ -81,7 +80,6 @@ def write_report(
         results: of the same runs.
         folder: made if missing; receives ``report.html``, ``results.json``, ``table.md``,
             ``table.csv``, ``table.tex`` and each figure as PDF and PNG.
-        title: of the page.
         progress: called with what is being made.
 
     Returns:
@@ -111,7 +109,7 @@ def write_report(
         progress(f"figure {name}")
         figures += [figure(_CAPTIONS[name], path) for path in plot() if path.suffix == ".png"]
     page = folder / "report.html"
-    page.write_text(document(title, _sections(results, figures)), encoding="utf-8")
+    page.write_text(document("Tracking errors", _sections(results, figures)), encoding="utf-8")
     return page
 
 

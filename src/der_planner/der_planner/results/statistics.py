@@ -131,12 +131,8 @@ def _summary(key: Key, runs: Sequence[RunResult]) -> Summary:
     )
 
 
-def compare(results: Sequence[RunResult], baseline: str = "pcc") -> list[Comparison]:
-    """Compare every model with the baseline: same limb, same loads, same motion.
-
-    Args:
-        results: of all runs.
-        baseline: name of the model to compare with.
+def compare(results: Sequence[RunResult]) -> list[Comparison]:
+    """Compare every model with the baseline ``pcc``: same limb, same loads, same motion.
 
     Returns:
         One comparison per limb, loads, motion and (model, method) against each baseline method.
@@ -146,10 +142,10 @@ def compare(results: Sequence[RunResult], baseline: str = "pcc") -> list[Compari
     several = len({namespace for namespace, *_ in groups}) > 1
     found = []
     for (namespace, loads, motion, model, method), runs in groups.items():
-        if model == baseline:
+        if model == "pcc":
             continue
         for (*other, other_model, other_method), others in groups.items():
-            if other == [namespace, loads, motion] and other_model == baseline:
+            if other == [namespace, loads, motion] and other_model == "pcc":
                 pair = Comparison(
                     motion,
                     f"{model} {method}".strip(),
