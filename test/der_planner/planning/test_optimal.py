@@ -9,19 +9,19 @@ from scipy.optimize import linprog
 from der_planner.limb import Limb
 from der_planner.model import CONTROL_PERIOD, RodModel
 from der_planner.model.air import Air
-from der_planner.planning import Motion, Workspace, planner
+from der_planner.planning import Motion, Workspace, optimal, planner
 from der_planner.planning.configuration import configure
-from der_planner.planning.optimal import Optimiser, OptimiserSettings, solve_limited
+from der_planner.planning.optimal import WINDOW, Optimiser, solve_limited
 
 LIMB = Limb.default()
 
 
-def solver_for(limb, motion, **settings):
+def solver_for(limb, motion, window=WINDOW):
     model = RodModel(limb)
     reference = motion.reference(Workspace(model))
     configuration = configure(model, reference)
     warm, _ = planner.balance(configuration, reference, "projected")
-    return Optimiser(configuration, reference, warm, OptimiserSettings(**settings))
+    return Optimiser(configuration, reference, warm, window=window)
 
 
 @pytest.fixture(scope="module")
@@ -49,9 +49,9 @@ def test_gradient_of_the_cost_against_finite_differences(fast):
 
 def test_windows_agree_with_one_window():
     motion = Motion.named("opposite_direction", period=6.0, cycles=1)
-    whole = solver_for(LIMB, motion, window=1000, settled=1000).run()
+    whole = solver_for(LIMB, motion, window=1000).run()
     windows = solver_for(LIMB, motion).run()
-    assert len(windows.commands) > 1.2 * OptimiserSettings().window
+    assert len(windows.commands) > 1.2 * WINDOW
     assert np.abs(whole.tip - windows.tip).max() < 5e-5
     assert np.abs(whole.commands - windows.commands).max() < 60.0
 
@@ -90,7 +90,8 @@ def test_nothing_within_the_limits_is_better_than_the_limited_programme():
 def test_each_window_begins_within_the_limits(monkeypatch):
     """Where a window has moved away from the guess of the next one, there is no jump between."""
     motion = Motion.named("asynchronous", amplitude=0.2, period=4.0, cycles=1)
-    solver = solver_for(LIMB, motion, window=30, settled=20)
+    solver = solver_for(LIMB, motion, window=30)
+    monkeypatch.setattr(optimal, "_SETTLED", 20)
     guess = np.zeros_like(solver.warm)
 
     def moved(command, state, first, last):

@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from der_planner.arrays import Array
-from der_planner.control.knowledge import Estimate, EstimatorSettings, Knowledge
+from der_planner.control.knowledge import Estimate, Knowledge
 from der_planner.control.nominal import STEP, ChamberLog, Nominal
 from der_planner.model import CONTROL_PERIOD, STEPS
 from der_planner.model.material import Memory
@@ -41,6 +41,26 @@ _WAITED_FOR = 1.0
 """The first picture that comes may be so much younger than one that comes later [s]."""
 EARLIEST = 2.0
 """The limb is watched from so long before the first setpoint on [s]."""
+_NOISE = (2e-3, 3e-4)
+"""Deviation of a measured bend angle [rad] and tip [m] whose covariance is not given."""
+_FIRST = (0.03, 0.03, 600.0, 0.15, 3e-3)
+"""Deviation of δθ [rad], δθ̇ [rad/s], d [Pa], g and b [m] before the first measurement."""
+_PRESSURE_DENSITY = 15.0
+"""Density of the effective pressure that is white noise [Pa √s]."""
+MISSING_DENSITY = 250.0
+"""Density with which d wanders [Pa/√s]."""
+_GAIN_DENSITY = 0.01
+"""Density with which g wanders [1/√s]."""
+_TIP_DENSITY = 4e-4
+"""Density with which b wanders [m/√s]."""
+_TIP_TIME = 20.0
+"""Time in which b is forgotten [s]."""
+_MEMORY_TIME = 0.4
+"""Time of the low-pass of δθ before friction and creep [s]."""
+_STRANGE = 6.0
+"""Squared distance per coordinate from where a measurement counts less."""
+_EVENT = (0.0, 0.5, 1000.0, 0.05, 0.0)
+"""What an event adds to the deviation of δθ, δθ̇ [rad/s], d [Pa], g and b."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +76,7 @@ class Estimator:
     Args:
         nominal: the model's motion under the plan.
         chambers: their commands and readings.
-        settings: of the noise.
+        missing_density: with which d wanders [Pa/√s].
         history: states and measurements are kept for this long [s].
 
     Attributes:
@@ -69,12 +89,11 @@ class Estimator:
         self,
         nominal: Nominal,
         chambers: ChamberLog,
-        settings: EstimatorSettings | None = None,
+        missing_density: float = MISSING_DENSITY,
         history: float = HISTORY,
     ) -> None:
         self.nominal, self.chambers = nominal, chambers
         self._kept = round(history / STEP)
-        self.settings = settings or EstimatorSettings()
         self.inputs = nominal.model.inputs
         self.innovations: list[tuple[float, float, int]] = []
         self.newest = -math.inf
@@ -82,7 +101,7 @@ class Estimator:
         self._known: dict[int, Knowledge] = {}
         self._last = 0
         self._fresh: set[int] = set()
-        self._moves, self._noises = self._prepare()
+        self._moves, self._noises = self._prepare(missing_density)
 
     # What comes in -------------------------------------------------------------------------
 
@@ -136,8 +155,7 @@ class Estimator:
         self._forget(j)
 
     def _noise(self, covariance: ArrayLike | None) -> Array:
-        settings, inputs = self.settings, self.inputs
-        noise = np.diag(np.repeat([settings.bend_noise**2, settings.tip_noise**2], [inputs, 2]))
+        noise = np.diag(np.repeat(np.square(_NOISE), [self.inputs, 2]))
         given = noise if covariance is None else np.asarray(covariance, dtype=float)
         if given.shape not in ((2, 2), noise.shape) or (np.diagonal(given) < 0.0).any():
             raise ValueError(
@@ -210,11 +228,8 @@ class Estimator:
 
     def beginning(self, first: int) -> Knowledge:
         """Return the prior state at fine step ``first``, before anything was measured."""
-        settings, inputs = self.settings, self.inputs
-        deviation = np.repeat(
-            [0.03, 0.03, settings.missing_first, settings.gain_first, settings.tip_first],
-            [inputs, inputs, inputs, inputs, 2],
-        )
+        inputs = self.inputs
+        deviation = np.repeat(_FIRST, [inputs, inputs, inputs, inputs, 2])
         zero = np.zeros(inputs)
         here = self.nominal.steps(first)
         memory = Memory(self.nominal.fine_bend[here], zero, zero)
@@ -267,7 +282,7 @@ class Estimator:
         pushed = (effective - nominal.effective[steps]) @ push.T
         move, noise = self._moves[k].copy(), self._noises[k]
         swing = 2 * inputs
-        share = STEP / self.settings.memory_time
+        share = STEP / _MEMORY_TIME
         for i, felt in enumerate(effective):
             known = self._updated(first + i, self._known[first + i])
             move[:swing, swing + inputs : swing + 2 * inputs] = push * felt
@@ -284,26 +299,23 @@ class Estimator:
                 known.row,
             )
 
-    def _prepare(self) -> tuple[Array, Array]:
+    def _prepare(self, missing_density: float) -> tuple[Array, Array]:
         """Return F without its column of g, and the covariance that a fine step adds.
 
         Of each control period, (K', 4M + 2, 4M + 2).
         """
-        nominal, settings, inputs = self.nominal, self.settings, self.inputs
+        nominal, inputs = self.nominal, self.inputs
         size, swing = 4 * inputs + 2, 2 * inputs
         moves = np.tile(np.eye(size), (nominal.count, 1, 1))
         moves[:, :swing, :swing] = nominal.fine_transition
         moves[:, :swing, swing : swing + inputs] = nominal.fine_input
-        moves[:, -2:, -2:] *= math.exp(-STEP / settings.tip_time)
+        moves[:, -2:, -2:] *= math.exp(-STEP / _TIP_TIME)
         wander = np.repeat(
-            [0.0, settings.missing_density, settings.gain_density, settings.tip_density],
-            [swing, inputs, inputs, 2],
+            [0.0, missing_density, _GAIN_DENSITY, _TIP_DENSITY], [swing, inputs, inputs, 2]
         )
         noises = np.tile(np.diag(wander**2 * STEP), (nominal.count, 1, 1))
         push = nominal.fine_input
-        noises[:, :swing, :swing] += (
-            push @ np.swapaxes(push, 1, 2) * (settings.pressure_density**2 / STEP)
-        )
+        noises[:, :swing, :swing] += push @ np.swapaxes(push, 1, 2) * (_PRESSURE_DENSITY**2 / STEP)
         return moves, noises
 
     def _remember(self, known: Knowledge, bend: Array) -> tuple[Memory, Array]:
@@ -326,7 +338,7 @@ class Estimator:
         return rows
 
     def _update(self, entry: _Measurement, known: Knowledge) -> Knowledge:
-        settings, inputs = self.settings, self.inputs
+        inputs = self.inputs
         bend, _, tip = self.nominal.at(entry.time)
         change = known.mean[:inputs]
         moved = self.nominal.moved_tip(bend, change) + known.mean[-2:]
@@ -340,20 +352,16 @@ class Estimator:
         if id(entry) in self._fresh:
             self._fresh.discard(id(entry))
             self.innovations.append((entry.time, distance * len(gap), len(gap)))
-        row = known.row + 1 if distance > settings.strange else 0
+        row = known.row + 1 if distance > _STRANGE else 0
         if row >= 2:
             # Once may be a bad picture, twice is the limb: a push, a load, a gain that fell.
             spread = spread + np.diag(
-                np.repeat(
-                    [0.0, settings.event_rate, settings.event_missing, settings.event_gain, 0.0],
-                    [inputs, inputs, inputs, inputs, 2],
-                )
-                ** 2
+                np.repeat(np.square(_EVENT), [inputs, inputs, inputs, inputs, 2])
             )
             expected = rows @ spread @ rows.T + noise
             row = 0
         elif row:
-            expected = expected + noise * (distance / settings.strange * len(gap))
+            expected = expected + noise * (distance / _STRANGE * len(gap))
         gain = np.linalg.solve(expected, rows @ spread).T
         mean = known.mean + gain @ gap
         spread = spread - gain @ expected @ gain.T

@@ -11,17 +11,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from der_planner.arrays import Array, interpolate
-from der_planner.control.estimation import Estimator
+from der_planner.control.estimation import MISSING_DENSITY, Estimator
 from der_planner.control.force import Touch
-from der_planner.control.knowledge import EstimatorSettings
 from der_planner.control.nominal import STEP, ChamberLog, Nominal
 from der_planner.control.touch import TouchSense
 from der_planner.model import CONTROL_PERIOD, STEPS
 from der_planner.planning.plan_file import Plan
 
-_SLOW = EstimatorSettings(missing_density=100.0)
-"""What the model lacks changes more slowly than feedback reckons with, so that a gain that is lower
-shows as a gain."""
+_SLOW = 100.0
+"""Density with which the pressure that the model lacks wanders in hindsight [Pa/√s].
+
+It is less than feedback reckons with, so that a gain that is lower shows as a gain.
+"""
 _WHOLE = 1e6
 """A history that is longer than any run [s]."""
 _BEFORE = 1.0
@@ -114,7 +115,7 @@ def touches(plan: Plan, filmed: Filmed) -> list[tuple[Touch, float]]:
     Raises:
         ValueError: no pictures or no measured pressures, or of another limb.
     """
-    estimator, last = _forward(plan, filmed, EstimatorSettings())
+    estimator, last = _forward(plan, filmed, MISSING_DENSITY)
     nominal, found = estimator.nominal, dict[float, tuple[Touch, float]]()
     sense = TouchSense(nominal.model)
     for j, known in enumerate(estimator.between(0, last)[1]):
@@ -127,11 +128,11 @@ def touches(plan: Plan, filmed: Filmed) -> list[tuple[Touch, float]]:
     return list(found.values())
 
 
-def _forward(plan: Plan, filmed: Filmed, settings: EstimatorSettings) -> tuple[Estimator, int]:
+def _forward(plan: Plan, filmed: Filmed, missing_density: float) -> tuple[Estimator, int]:
     """Return an estimator that has seen a whole run, and its last fine step."""
     nominal = Nominal(plan)
     chambers = ChamberLog(nominal, kept=_WHOLE)
-    estimator = Estimator(nominal, chambers, settings, history=_WHOLE)
+    estimator = Estimator(nominal, chambers, missing_density, history=_WHOLE)
     for time, pressures in zip(filmed.pressure_time, filmed.differential_pressure, strict=True):
         chambers.read(float(time), pressures)
     seen = np.isfinite(filmed.tip).all(axis=1) & (filmed.picture_time > -_BEFORE)

@@ -1,4 +1,4 @@
-"""The estimator's assumptions about noise, and its state."""
+"""What the estimator tells of the limb, and its own state."""
 
 from __future__ import annotations
 
@@ -8,40 +8,6 @@ import numpy as np
 
 from der_planner.arrays import Array
 from der_planner.model.material import Memory
-
-
-@dataclass(frozen=True)
-class EstimatorSettings:
-    """Standard deviations; densities are those of what wanders, per √s.
-
-    Attributes:
-        bend_noise: of a measured bend angle whose covariance is not given [rad].
-        tip_noise: of a coordinate of a tip whose covariance is not given [m].
-        pressure_density: of the effective pressure that is white noise [Pa √s].
-        missing_first, missing_density: of d [Pa], [Pa/√s].
-        gain_first, gain_density: of g [-], [1/√s].
-        tip_first, tip_density: of b [m], [m/√s].
-        tip_time: in which b is forgotten [s].
-        memory_time: low-pass of δθ before friction and creep [s].
-        strange: squared distance per coordinate from where a measurement counts less.
-        event_missing, event_rate, event_gain: what an event adds to d [Pa], rates [rad/s], g.
-    """
-
-    bend_noise: float = 2e-3
-    tip_noise: float = 3e-4
-    pressure_density: float = 15.0
-    missing_first: float = 600.0
-    missing_density: float = 250.0
-    gain_first: float = 0.15
-    gain_density: float = 0.01
-    tip_first: float = 3e-3
-    tip_density: float = 4e-4
-    tip_time: float = 20.0
-    memory_time: float = 0.4
-    strange: float = 6.0
-    event_missing: float = 1000.0
-    event_rate: float = 0.5
-    event_gain: float = 0.05
 
 
 @dataclass(frozen=True)

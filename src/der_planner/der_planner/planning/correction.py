@@ -26,7 +26,7 @@ from der_planner.model.bending import inverse_kinematics
 from der_planner.model.simulation import Bend
 from der_planner.planning.configuration import configure
 from der_planner.planning.loads import PlanningError
-from der_planner.planning.optimal import Optimiser, OptimiserSettings, Optimum
+from der_planner.planning.optimal import Optimiser, Optimum
 from der_planner.planning.plan_file import SUFFIX, Plan, difference, read_plan
 from der_planner.rod import ConvergenceError
 
@@ -176,9 +176,8 @@ class Correction:
         weight, offset = pull * self.tip_per_pressure, self._plan.tip_reference - wanted
         found: list[tuple[float, Optimum]] = []
         for window in _WINDOWS:
-            settings = OptimiserSettings(nearness=weight, nearness_vented=weight, window=window)
             solver = Optimiser(
-                self._configuration, self._plan.reference, commands, settings, offset
+                self._configuration, self._plan.reference, commands, offset, weight, window
             )
             outcome = solver.run(begin=begin)
             missed = float(np.linalg.norm(outcome.tip - wanted, axis=1).mean())

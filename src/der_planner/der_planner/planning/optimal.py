@@ -41,33 +41,29 @@ _PRESSURE = 1e3
 _LENGTH = 1e-3
 """Length of one unit of the solver [m]."""
 
+_SMOOTHNESS = 2e-7
+"""√λ, tip error that a unit second difference is worth [m/Pa]."""
+_NEARNESS = 1e-8
+"""√μ, tip error that a unit deviation from the warm start is worth [m/Pa]."""
+_NEARNESS_VENTED = 3e-7
+"""√μ of a limb whose chambers are vented slowly [m/Pa].
 
-@dataclass(frozen=True)
-class OptimiserSettings:
-    """What the optimisation weighs and when it is content.
+Close to the straight pose the tip hardly tells the segments apart, and what one of them is asked
+for in vain must not be taken from the other.
+"""
+WINDOW = 100
+"""Setpoints that are solved together."""
+_SETTLED = 75
+"""Setpoints of a window that are kept; the rest is solved again."""
+_ITERATIONS = 6
+"""Gauss-Newton steps a window at most."""
+_TOLERANCE = 1e-5
+"""Root mean square tip error below which a window is done [m].
 
-    Attributes:
-        smoothness: √λ, tip error that a unit second difference is worth [m/Pa].
-        nearness: √μ, tip error that a unit deviation from the warm start is worth [m/Pa].
-        nearness_vented: the same for a limb whose chambers are vented slowly [m/Pa]: close to the
-            straight pose the tip hardly tells the segments apart, and what one of them is asked
-            for in vain must not be taken from the other.
-        window: setpoints that are solved together.
-        settled: setpoints of a window that are kept; the rest is solved again.
-        iterations: Gauss-Newton steps a window at most.
-        tolerance: root mean square tip error below which a window is done, and change of it below
-            which another step is not worth its time [m].
-        reuse: share of the error that a step must take away for its linearisation to be used again.
-    """
-
-    smoothness: float = 2e-7
-    nearness: float = 1e-8
-    nearness_vented: float = 3e-7
-    window: int = 100
-    settled: int = 75
-    iterations: int = 6
-    tolerance: float = 1e-5
-    reuse: float = 0.7
+Another step that changes it by less than a fifth of this is not worth its time.
+"""
+_REUSE = 0.7
+"""Share of the error that a step must take away for its linearisation to be used again."""
 
 
 @dataclass(frozen=True)
@@ -95,9 +91,10 @@ class Optimiser:
         reference: r̄.
         warm: (K, M) commands where the search starts and toward which they are pulled: those of a
             balance, before limits, or the last ones played [Pa].
-        settings: weights and sizes.
         offset: (K, 2) what is added to the model's tip at the setpoints before it is compared with
             r̄, e.g. what a run showed beyond the model [m]; None: nothing.
+        nearness: √μ [m/Pa]; None: as the chambers are vented.
+        window: setpoints that are solved together.
     """
 
     def __init__(
@@ -105,13 +102,14 @@ class Optimiser:
         configuration: Configuration,
         reference: Reference,
         warm: Array,
-        settings: OptimiserSettings | None = None,
         offset: Array | None = None,
+        nearness: float | None = None,
+        window: int = WINDOW,
     ) -> None:
         self.model = model = configuration.model
-        self.settings = settings or OptimiserSettings()
-        vented = model.air.vents_slowly
-        self.nearness = self.settings.nearness_vented if vented else self.settings.nearness
+        usual = _NEARNESS_VENTED if model.air.vents_slowly else _NEARNESS
+        self.nearness = usual if nearness is None else nearness
+        self.window = window
         wanted = reference.tip if offset is None else reference.tip - offset
         self.target = np.concatenate([wanted[1:], wanted[-1:]])
         self.warm = warm
@@ -139,10 +137,10 @@ class Optimiser:
         tip = np.empty((count, 2))
         first, steps, limited = 0, 0, 0
         while first < count:
-            last = min(first + self.settings.window, count)
-            if count - last < self.settings.window - self.settings.settled:
+            last = min(first + self.window, count)
+            if count - last < self.window - _SETTLED:
                 last = count
-            keep = last if last == count else first + self.settings.settled
+            keep = last if last == count else first + _SETTLED
             # The window before may have moved away from what was guessed of this one: a search that
             # begins beyond a limit may find nothing better within it.
             command[first:], _ = within_limits(
@@ -159,14 +157,13 @@ class Optimiser:
 
     def improve(self, command: Array, state: State, first: int, last: int) -> tuple[int, bool]:
         """Improve ``command[first:last]`` in place; return the steps and if a limit was met."""
-        settings, air = self.settings, self.model.air
-        met, damping = False, 0.0
+        air, met, damping = self.model.air, False, 0.0
         jacobian: Array | None = None
         cost, misses, window = self._evaluate(command, state, first, last)
         before = command[first - 1] if first else self.before
-        for step in range(settings.iterations):
+        for step in range(_ITERATIONS):
             rms = rms_distance(misses)
-            if rms < settings.tolerance:
+            if rms < _TOLERANCE:
                 return step, met
             if jacobian is None:
                 jacobian, hessian = self._linearise(window, state, damping)
@@ -188,11 +185,11 @@ class Optimiser:
             gained = rms - rms_distance(new[1])
             command[:last] = trial
             cost, misses, window = new
-            if gained < max(settings.tolerance / 5, 0.02 * rms):
+            if gained < max(_TOLERANCE / 5, 0.02 * rms):
                 return step + 1, met
-            if gained < settings.reuse * rms:
+            if gained < _REUSE * rms:
                 jacobian = None
-        return settings.iterations, met
+        return _ITERATIONS, met
 
     def _evaluate(
         self, command: Array, state: State, first: int, last: int
@@ -216,7 +213,7 @@ class Optimiser:
         The first two deviations are those of the setpoints before the window.
         """
         each = np.eye(size + 2)
-        smooth = self.settings.smoothness * np.diff(each, 2, axis=0)
+        smooth = _SMOOTHNESS * np.diff(each, 2, axis=0)
         return np.concatenate([smooth, self.nearness * each[2:]])
 
     def _deviation(self, command: Array, first: int) -> Array:
