@@ -14,13 +14,14 @@ from apriltag_tracker.camera import (
 MATRIX = [1250.0, 0.0, 642.3, 0.0, 1240.0, 357.1, 0.0, 0.0, 1.0]
 PLUMB_BOB = [-0.11, 0.06, 0.0006, -0.0004, 0.01]
 RATIONAL = [0.2, -0.1, 0.0006, -0.0004, 0.01, 0.3, -0.05, 0.002]
+WIDE = [-0.4, 0.25, 0.0005, -0.0005, -0.09]
 
 
 def intrinsics(distortion) -> Intrinsics:
     return Intrinsics.create(1280, 720, MATRIX, distortion)
 
 
-@pytest.mark.parametrize("distortion", [[], PLUMB_BOB, RATIONAL])
+@pytest.mark.parametrize("distortion", [[], PLUMB_BOB, RATIONAL, WIDE])
 def test_rays_undo_the_lens_of_opencv(distortion):
     lens = intrinsics(distortion)
     pixels = np.random.default_rng(2).uniform([0, 0], [1280, 720], (200, 2))
