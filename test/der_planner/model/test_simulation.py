@@ -135,15 +135,18 @@ def test_derivatives_against_finite_differences(model, given, known, limb):
 
 
 def test_friction_creep_and_shape_go_on_from_where_they_were():
-    whole = simulate(LIMB, TIME, pressures=COMMANDS)
-    half = COUNT // 2
-    first = simulate(LIMB, TIME[: half + 1], pressures=COMMANDS[: half + 1])
-    left = Initial(first.final, memory=first.memory)
-    second = simulate(LIMB, TIME[half:], pressures=COMMANDS[half:], initial=left)
-    assert np.abs(first.memory.friction).max() > 0.5
-    np.testing.assert_allclose(second.bend_angles, whole.bend_angles[half:], atol=1e-9)
-    forgot = simulate(LIMB, TIME[half:], pressures=COMMANDS[half:], initial=Initial(first.final))
-    assert np.abs(forgot.bend_angles - whole.bend_angles[half:]).max() > 0.01
+    material, half = Material(LIMB), COUNT // 2
+    whole = material.remember(TIME, bend(TIME))
+    first = material.remember(TIME[: half + 1], bend(TIME[: half + 1]))
+    second = material.remember(TIME[half:], bend(TIME[half:]), first.at(-1))
+    assert np.abs(first.at(-1).friction).max() > 0.5
+    np.testing.assert_allclose(second.friction, whole.friction[half:], atol=1e-9)
+    np.testing.assert_allclose(second.creep, whole.creep[half:], atol=1e-9)
+    limb = Limb.default()
+    moved = simulate(limb, TIME, pressures=COMMANDS)
+    begun = simulate(limb, TIME[: half + 1], pressures=COMMANDS[: half + 1]).final
+    on = simulate(limb, TIME[half:], pressures=COMMANDS[half:], initial=Initial(begun))
+    np.testing.assert_allclose(on.bend_angles, moved.bend_angles[half:], atol=1e-9)
 
 
 @pytest.mark.parametrize("mounting", ["10", "hanging", "sideways"])

@@ -9,7 +9,7 @@ bends them as the differential pressure u bends the limb,
     q̇ = κ̇ − q / τ                       Maxwell creep
 
 with θ the bend angle [rad], κ = θ / L, and c the coupling to the neighbours' pressures. A limb that
-has rested starts with z = q = 0; `Memory` carries them on from an earlier simulation. A cubic
+has rested starts with z = q = 0; `Memory` carries them on from an earlier instant. A cubic
 stiffness belongs to the models themselves, which take it from the limb.
 
 Friction and creep act along a bend history that is known (that of a planned motion), or along the
@@ -141,7 +141,7 @@ class Material:
     # What friction and creep remember ----------------------------------------------------------
 
     def remember(self, time: Array, bend_angle: Array, start: Memory | None = None) -> Memory:
-        """Return z and q along bend histories (K, M) [rad]; arguments as of `memory_pressures`."""
+        """Return z and q along bend histories (K, M) [rad] from a start on; None: a rested limb."""
         friction, creep = np.zeros_like(bend_angle), np.zeros_like(bend_angle)
         for index, segment in enumerate(self._segments):
             angle = np.ascontiguousarray(bend_angle[:, index])
@@ -168,34 +168,28 @@ class Material:
             time: (K,) rising [s].
             bend_angle: (K, M) [rad].
         """
-        return self.pressure_taken(self.remember(time, bend_angle, None))
+        return self.pressure_taken(self.remember(time, bend_angle))
 
     # Along the bend at rest --------------------------------------------------------------------
 
-    def slow(
-        self, time: Array, differential: Array, start: Memory | None = None
-    ) -> tuple[Array, Memory]:
+    def slow(self, time: Array, differential: Array) -> Array:
         """Return effective pressures (K, M) [Pa] of chamber pressures (K, M) [Pa] alone.
 
-        Friction and creep act along the bend of `resting_bend`. What they remember at the end is
-        returned, too.
+        Friction and creep act along the bend of `resting_bend`.
         """
-        history = self.remember(time, self.resting_bend(time, differential, start), start)
-        return self.without_memory(differential, self.pressure_taken(history)), history.at(-1)
+        taken = self.memory_pressures(time, self.resting_bend(time, differential))
+        return self.without_memory(differential, taken)
 
-    def resting_bend(
-        self, time: ArrayLike, differential: ArrayLike, start: Memory | None = None
-    ) -> Array:
+    def resting_bend(self, time: ArrayLike, differential: ArrayLike) -> Array:
         """Return the bend angles (K, M) [rad] of a slow motion under chamber pressures [Pa].
 
         Without inertia each segment bends by its own moment and the limb's weight; friction and
-        creep are solved for at each instant together with the bend, since they act along it.
+        creep are solved for at each instant together with the bend, since they act along it. The
+        limb has rested under the first pressures.
 
         Args:
             time: (K,) rising [s].
             differential: (K, M) [Pa].
-            start: bend and memory at ``time[0]``; None: at rest under the first pressures, without
-                any.
         """
         driven, stiffer, _, _ = self._drive(np.asarray(differential, dtype=float))
         bend: Array = rest_along(
@@ -203,31 +197,24 @@ class Material:
             np.ascontiguousarray(driven),
             np.ascontiguousarray(stiffer),
             self.resting_law,
-            self._begin(start),
         )
         return bend
 
-    def slow_change(
-        self, time: Array, differential: Array, change: Array, start: Memory | None = None
-    ) -> Array:
+    def slow_change(self, time: Array, differential: Array, change: Array) -> Array:
         """Return the first-order change (K, M) of the effective pressures along the bend at rest.
 
         Args:
             time: (K,) [s].
             differential: (K, M) in the chambers [Pa].
             change: (K, M) of them [Pa].
-            start: as of `resting_bend`.
         """
-        bend = self.resting_bend(time, differential, start)
-        taken = self.pressure_taken(self.remember(time, bend, start))
-        effective = self.without_memory(differential, taken)
+        bend = self.resting_bend(time, differential)
+        effective = self.without_memory(differential, self.memory_pressures(time, bend))
         _, stiffer, gain, stiffening = self._drive(differential)
         moved = change * gain + change @ self._coupling.T - effective * change * stiffening
         law = self.resting_law
         pushed = (law.gain * moved / stiffer)[..., None]
-        _, taken_by = change_along(
-            np.ascontiguousarray(time), stiffer, bend, law, self._begin(start), pushed
-        )
+        _, taken_by = change_along(np.ascontiguousarray(time), stiffer, bend, law, pushed)
         result: Array = (moved - taken_by[..., 0]) / stiffer
         return result
 
@@ -258,12 +245,12 @@ class Material:
         Args:
             time: (K,) [s].
             differential: (K, M) in the chambers [Pa].
-            bend: (K, M) found by `resting_bend` without a start [rad].
+            bend: (K, M) found by `resting_bend` [rad].
             driven: (K, M, P) changes of `driven_bend` [rad].
         """
         _, stiffer, _, _ = self._drive(differential)
         change: Array = change_along(
-            np.ascontiguousarray(time), stiffer, bend, self.resting_law, self._begin(None), driven
+            np.ascontiguousarray(time), stiffer, bend, self.resting_law, driven
         )[0]
         return change
 
@@ -275,13 +262,6 @@ class Material:
         turns = weight.lever * (y * np.cos(heading) - x * np.sin(heading))
         torque: Array = turns @ weight.turning
         return torque
-
-    def _begin(self, start: Memory | None) -> Array:
-        """Return bend [rad], z and creep [rad] (M, 3) at the start; NaN: at rest."""
-        if start is None:
-            return np.full((self._count, 3), np.nan)
-        lengths = np.array([s.length for s in self._segments])
-        return np.stack([start.bend, start.friction, start.creep * lengths], axis=1)
 
     @cached_property
     def resting_law(self) -> RestingLaw:

@@ -119,24 +119,22 @@ def weigh(angle: Array, law: RestingLaw, torque: Array, slope: Array) -> None:
 
 
 @njit(cache=True)
-def rest_along(time: Array, driven: Array, stiffer: Array, law: RestingLaw, begin: Array) -> Array:
+def rest_along(time: Array, driven: Array, stiffer: Array, law: RestingLaw) -> Array:
     """Return the bend angles (K, M) [rad], solved at each instant by Newton's method.
+
+    The limb has rested under ``driven[0]``, with z = q = 0.
 
     Args:
         time: (K,) [s].
         driven: (K, M) pressures without friction and creep [Pa].
         stiffer: (K, M) growth of the stiffness.
         law: of the segments.
-        begin: (M, 3) θ [rad], z and q [rad] at ``time[0]``; NaN: at rest under ``driven[0]``, z = q
-            = 0.
     """
     instants, count = driven.shape
     bend = np.empty((instants, count))
-    angle, z, q = begin[:, 0].copy(), begin[:, 1].copy(), begin[:, 2].copy()
-    keep, share = np.zeros(count), np.zeros(count)
-    if np.isnan(begin[0, 0]):
-        angle[:], z[:], q[:] = law.rest, 0.0, 0.0
-        balance(angle, law, Instant(driven[0], stiffer[0], angle.copy(), z, q, keep, share))
+    angle = law.rest.copy()
+    z, q, keep, share = np.zeros((4, count))
+    balance(angle, law, Instant(driven[0], stiffer[0], law.rest, z, q, keep, share))
     bend[0] = angle
     for k in range(1, instants):
         for i in range(count):
@@ -240,21 +238,19 @@ def balanced_bend(
 
 @njit(cache=True)
 def change_along(
-    time: Array, stiffer: Array, bend: Array, law: RestingLaw, begin: Array, driven: Array
+    time: Array, stiffer: Array, bend: Array, law: RestingLaw, driven: Array
 ) -> tuple[Array, Array]:
     """Return what P small changes make of a bend at rest, to first order.
 
     Along bend angles (K, M) found by `rest_along`, by the implicit function theorem on the residual
     of each instant, φ + k φ³ − W(θ) − g (driven − f z' − c q') / stiffer with z' = s + (z − s)
-    exp(−|Δθ| / turn), s the sign of Δθ, and q' = keep q + share Δθ. The start is at rest, or given
-    and fixed.
+    exp(−|Δθ| / turn), s the sign of Δθ, and q' = keep q + share Δθ. The limb starts at rest.
 
     Args:
         time: (K,) [s].
         stiffer: (K, M) growth of the stiffness.
         bend: (K, M) [rad].
         law: of the segments.
-        begin: as of `rest_along`.
         driven: (K, M, P) change of g (driven − f z − c q) / stiffer − φ − k φ³ + W at a given bend
             [rad].
 
@@ -263,8 +259,7 @@ def change_along(
     """
     instants, count, changes = driven.shape
     bend_by, taken_by = np.empty(driven.shape), np.empty(driven.shape)
-    known = not np.isnan(begin[0, 0])
-    z = begin[:, 1].copy() if known else np.zeros(count)
+    z = np.zeros(count)
     torque, slope = np.zeros(count), np.zeros((count, count))
     angle_moved, z_moved, q_moved = np.zeros((3, count, changes))
     for k in range(instants):
@@ -289,9 +284,7 @@ def change_along(
             right[i] += rub * angle_moved[i]
             right[i] -= scale * law.friction[i] * z_kept[i, 0] * z_moved[i]
             right[i] -= scale * law.creep[i] * q_kept[i, 0] * q_moved[i]
-        after = np.zeros((count, changes))
-        if k > 0 or not known:
-            after[:] = np.linalg.solve(matrix, right)
+        after = np.linalg.solve(matrix, right)
         z_moved = z_kept * z_moved + z_by_change * (after - angle_moved)
         q_moved = q_kept * q_moved + q_by_change * (after - angle_moved)
         angle_moved = after

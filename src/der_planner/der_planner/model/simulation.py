@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from der_planner.arrays import Array
 from der_planner.limb import Limb
 from der_planner.model.air import Chambers
-from der_planner.model.material import Material, Memory
+from der_planner.model.material import Material
 from der_planner.model.model import FirstOrder, Model, State
 
 Bend = Callable[[Array], Array]
@@ -41,12 +41,10 @@ class Initial(NamedTuple):
         state: of the model; None: at rest, vented, or under the first ``pressures``.
         before: (M,) command before the first one, which the chambers had reached [Pa]; None:
             vented.
-        memory: of friction and creep; None: a limb that has rested.
     """
 
     state: State | None = None
     before: ArrayLike | None = None
-    memory: Memory | None = None
 
 
 AT_REST = Initial()
@@ -105,7 +103,6 @@ class Response:
         bend_angles: (K+1, M) [rad].
         tip: (K+1, 2) [m].
         final: state at the end.
-        memory: of friction and creep at the last instant at which they were computed.
         derivative: by the commands or pressures that were given, if it was asked for.
     """
 
@@ -115,7 +112,6 @@ class Response:
     bend_angles: Array
     tip: Array
     final: State
-    memory: Memory
     derivative: Derivative | None = None
 
 
@@ -162,7 +158,7 @@ def simulate(
         begin: State = model.rest if initial.state is None else initial.state
     else:
         count = steps or (1 if model.name == "der" else max(1, round(period / _ARC_STEP)))
-        felt = _from_pressures(model.material, times, given, count, bend, initial.memory)
+        felt = _from_pressures(model.material, times, given, count, bend)
         boundaries = times
         begin = model.resting(felt.first) if initial.state is None else initial.state
     moved = model.run(begin, felt.effective, period, "all" if linearise else "")
@@ -178,7 +174,6 @@ def simulate(
         moved.bend_angles,
         moved.tip,
         moved.final,
-        felt.memory,
         derivative,
     )
 
@@ -212,14 +207,12 @@ class _Felt(NamedTuple):
         effective: (n, S, M) [Pa].
         differential: (n, S, M) in the chambers [Pa].
         first: (M,) effective pressures at the first instant [Pa].
-        memory: left of friction and creep.
         change: see `Derivative`.
     """
 
     effective: Array
     differential: Array
     first: Array
-    memory: Memory
     change: Callable[[Array], tuple[Array, Array]]
 
 
@@ -229,27 +222,23 @@ def _from_commands(
     material, still = model.material, np.zeros(model.inputs)
     before = still if initial.before is None else np.array(initial.before, dtype=float)
     if bend is not None:
-        start = Initial(before=before, memory=initial.memory)
-        drive = Drive(model, bend, len(command), steps, start, period)
-        window = drive.window(command)
+        window = Drive(model, bend, len(command), steps, before, period).window(command)
 
         def along_bend(change: Array) -> tuple[Array, Array]:
             differential = np.einsum("wsjm,jm->wsm", window.by_command(), change)
             return np.einsum("wsij,wsj->wsi", window.slopes, differential), still
 
-        return _Felt(window.effective, window.differential, still, drive.memory(), along_bend)
+        return _Felt(window.effective, window.differential, still, along_bend)
     chambers = model.air.follow(command, period, steps, before)
     shape, middle = chambers.differential.shape, step_middles(len(command), steps, period)
     flat = np.ascontiguousarray(chambers.differential.reshape(-1, model.inputs))
-    effective, memory = material.slow(middle, flat, initial.memory)
+    effective = material.slow(middle, flat)
 
     def at_rest(change: Array) -> tuple[Array, Array]:
         differential = np.einsum("wsjm,jm->wsm", chambers.derivative(), change).reshape(flat.shape)
-        return material.slow_change(middle, flat, differential, initial.memory).reshape(
-            shape
-        ), still
+        return material.slow_change(middle, flat, differential).reshape(shape), still
 
-    return _Felt(effective.reshape(shape), chambers.differential, still, memory, at_rest)
+    return _Felt(effective.reshape(shape), chambers.differential, still, at_rest)
 
 
 def _from_pressures(
@@ -258,24 +247,22 @@ def _from_pressures(
     pressure: Array,
     steps: int,
     bend: Bend | None,
-    memory: Memory | None,
 ) -> _Felt:
     if bend is None:
-        effective, left = material.slow(time, pressure, memory)
+        effective = material.slow(time, pressure)
     else:
-        history = material.remember(time, bend(time), memory)
-        effective = material.without_memory(pressure, material.pressure_taken(history))
-        left = history.at(-1)
+        taken = material.memory_pressures(time, bend(time))
+        effective = material.without_memory(pressure, taken)
 
     def change(given: Array) -> tuple[Array, Array]:
         if bend is None:
-            moved = material.slow_change(time, pressure, given, memory)
+            moved = material.slow_change(time, pressure, given)
         else:
             moved = np.einsum("kij,kj->ki", material.slopes(pressure, effective), given)
         return means_between(moved, steps), moved[0]
 
     differential = means_between(pressure, steps)
-    return _Felt(means_between(effective, steps), differential, effective[0], left, change)
+    return _Felt(means_between(effective, steps), differential, effective[0], change)
 
 
 def step_middles(count: int, steps: int, period: float = CONTROL_PERIOD) -> Array:
@@ -336,7 +323,7 @@ class Drive:
         bend: of the motion.
         count: K.
         steps: S, integrator steps a command.
-        initial: command and memory at the first command.
+        before: (M,) command before the first one [Pa]; None: vented.
         period: of a command [s].
     """
 
@@ -346,15 +333,14 @@ class Drive:
         bend: Bend,
         count: int,
         steps: int,
-        initial: Initial = AT_REST,
+        before: Array | None = None,
         period: float = CONTROL_PERIOD,
     ) -> None:
         self._air, self._material = model.air, model.material
-        self.steps, self.before, self.period = steps, initial.before, period
+        self.steps, self.before, self.period = steps, before, period
         self._remembered = int(np.ceil(model.air.memory / period))
         middle = step_middles(count, steps, period)
-        self._history = model.material.remember(middle, bend(middle), initial.memory)
-        taken = model.material.pressure_taken(self._history)
+        taken = model.material.memory_pressures(middle, bend(middle))
         self._taken = taken.reshape(count, steps, -1)
 
     def window(self, command: Array, first: int = 0) -> Window:
@@ -370,7 +356,3 @@ class Drive:
         differential = chambers.differential[first - begin :]
         effective = self._material.without_memory(differential, self._taken[first : len(command)])
         return Window(self._material, first, chambers, begin, effective)
-
-    def memory(self) -> Memory:
-        """Return what friction and creep remember amid the last integrator step."""
-        return self._history.at(-1)

@@ -27,7 +27,7 @@ import piqp
 from scipy.linalg import cho_factor, cho_solve
 
 from der_planner.arrays import Array, rms_distance
-from der_planner.model import CONTROL_PERIOD, STEPS, Initial, State
+from der_planner.model import CONTROL_PERIOD, STEPS, State
 from der_planner.model.air import Air
 from der_planner.model.commands import within_limits
 from der_planner.model.simulation import Drive, Window
@@ -116,8 +116,7 @@ class Optimiser:
         count, inputs = warm.shape
         self.start, start = configuration.begin, configuration.start
         self.before = np.zeros(inputs) if start is None else start.pressure
-        initial = Initial(before=self.before)
-        self.drive = Drive(model, configuration.bend_at, count, STEPS, initial)
+        self.drive = Drive(model, configuration.bend_at, count, STEPS, self.before)
         pulse = model.air.even_pulse(CONTROL_PERIOD, STEPS)
         self._pulse = np.tile(pulse[:, None], (1, inputs))
 
