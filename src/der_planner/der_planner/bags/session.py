@@ -27,7 +27,6 @@ class RecordingSession:
 
     Attributes:
         writer: of the bag; its counters may be read.
-        paused: messages are ignored.
         dropped: messages that did not fit the queue.
         queued_bytes: waiting for the disk.
         failure: why the recording stopped by itself; empty while all is well.
@@ -51,12 +50,11 @@ class RecordingSession:
         self._count_lock = threading.Lock()
         self.dropped = 0
         self.failure = ""
-        self.paused = False
         self._thread = threading.Thread(target=self._run, name="bag writer", daemon=True)
         self._thread.start()
 
     def put(self, spec: TopicSpec, log_time: int, publish_time: int, data: bytes) -> bool:
-        """Queue one message; False if it was not taken (paused, failed or no room).
+        """Queue one message; False if it was not taken (failed or no room).
 
         Args:
             spec: its topic.
@@ -64,7 +62,7 @@ class RecordingSession:
             publish_time: when it was sent [ns].
             data: serialized CDR.
         """
-        if self.paused or self.failure:
+        if self.failure:
             return False
         with self._count_lock:
             if self.queued_bytes + len(data) > self._limit:

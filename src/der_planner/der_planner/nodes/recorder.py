@@ -15,7 +15,7 @@ from rclpy.serialization import serialize_message
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 from std_msgs.msg import String
-from std_srvs.srv import SetBool, Trigger
+from std_srvs.srv import Trigger
 
 from der_planner.bags.session import RecordingSession
 from der_planner.bags.topics import DefinitionError, OfferedQos, TopicSpec, message_class
@@ -79,7 +79,6 @@ class Recorder(Node):
         self._marks = 0
         self.create_service(Trigger, "~/start", self._on_start)
         self.create_service(Trigger, "~/stop", self._on_stop)
-        self.create_service(SetBool, "~/pause", self._on_pause)
         self.create_service(Trigger, "~/mark", self._on_mark)
         self._discover()
         self._discovery = self.create_timer(0.25, self._discover)
@@ -300,15 +299,6 @@ class Recorder(Node):
         response.success, response.message = self._stop()
         return response
 
-    def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        response.message = "not recording: start a recording first"
-        if self._session is not None:
-            self._receive_waiting()
-            self._session.paused = request.data
-            response.success = True
-            response.message = "paused" if request.data else "recording again"
-        return response
-
     def _on_mark(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         if self._session is None:
             response.message = "not recording: start a recording first"
@@ -318,9 +308,7 @@ class Recorder(Node):
         name = f"{self.get_fully_qualified_name()}/mark"
         spec = TopicSpec.installed(name, "std_msgs/msg/String", (OfferedQos(),))
         now = self._now()
-        paused, self._session.paused = self._session.paused, False
         response.success = self._session.put(spec, now, now, serialize_message(String(data=label)))
-        self._session.paused = paused
         response.message = label
         return response
 
@@ -337,7 +325,7 @@ class Recorder(Node):
             return Health("ok", "not recording", {**values, "state": "idle"})
         session, bag = self._session, self._session.writer
         values |= {
-            "state": "paused" if session.paused else "recording",
+            "state": "recording",
             "bag": bag.folder,
             "recorded": bag.message_count,
             "bytes": bag.byte_count,
@@ -351,7 +339,7 @@ class Recorder(Node):
             return Health("warning", lost, values)
         if values["missed"]:
             return Health("warning", f"messages that never arrived, {values['missed']}", values)
-        return Health("ok", f"{values['state']} into {bag.folder}", values)
+        return Health("ok", f"recording into {bag.folder}", values)
 
 
 def offered_qos(endpoints: list[TopicEndpointInfo]) -> tuple[OfferedQos, ...]:
