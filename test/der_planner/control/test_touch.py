@@ -102,7 +102,7 @@ def test_what_cannot_be_told_is_not_told(model):
 def test_a_limb_that_is_known_from_an_earlier_run_feels_more_though_it_rests_otherwise(model):
     rests, felt = np.array([300.0, -200.0, 1e-3, 0.0]), []
     hit = lacking(model, {15: (0.0, 0.1)})
-    for free in (FreeLevel(LIMB), calibrated().another_run()):
+    for free in (FreeLevel(LIMB), calibrated().for_next_run()):
         sense = TouchSense(model, free)
         for k in range(60):
             assert not sense.look(replace(KNOWN, time=k / 30, value=rests)).touched

@@ -117,7 +117,7 @@ class Feedback:
         That is how far the model is off where nothing touches the limb, what corrections bring, and
         whether they swing.
         """
-        self._sense.free = earlier._sense.free.another_run()
+        self._sense.free = earlier._sense.free.for_next_run()
         self._benefit.remember(earlier._benefit)
         self._supervisor.swings = earlier._supervisor.swings
 

@@ -50,9 +50,12 @@ _FRICTION_WRONG = 0.4
 _FRICTION_SLIDING = 0.0025
 """Its variance elsewhere, over the square of its largest."""
 _STILL = 0.5
-"""Share of the estimator's variance of what the model lacks that is noise of pictures: the other
-half lets it follow changes, of which a limb that nothing touches has few. With a gain K and noise r
-a random walk is known to K r, and what does not walk to K r / (2 − K)."""
+"""Share of the estimator's variance of what the model lacks that is left while nothing touches.
+
+The estimator takes what is lacking for a random walk, which a gain K knows to K r, with r the noise
+of pictures. Without a touch it hardly changes, and the same gain K knows it to K r / (2 − K), which
+is half as much for a small K.
+"""
 _STICKS = 0.01
 """Rate of a bend angle below which its segment may stick [rad/s]."""
 _SLIDES_AFTER, _LATEST_SLIDE = 2.0, 0.1
@@ -132,7 +135,7 @@ class Lacking:
         left[:segments] -= np.clip(left[:segments], *self.stuck)
         return left
 
-    def by(self, kept: float) -> Array:
+    def regressors(self, kept: float) -> Array:
         """Return what c, γ, κ, φ and e are multiplied by, with the share of e that is left."""
         return np.concatenate([[1.0], self.effective, self.bend_angles, self.friction, [kept]])
 
@@ -174,7 +177,7 @@ class FreeLevel:
         self._covariance[:, -1, -1] = _WANDERS * self.noise
         self._worth = _FIRST_WORTH
 
-    def another_run(self) -> FreeLevel:
+    def for_next_run(self) -> FreeLevel:
         """Return what is known of the limb in its next run: it may rest and be loaded otherwise."""
         after = copy.deepcopy(self)
         after.payload = 0.0
@@ -189,7 +192,7 @@ class FreeLevel:
             ahead: time since something was learned [s].
         """
         kept = np.exp(-ahead / _FORGOTTEN)
-        by = lacking.by(kept)
+        by = lacking.regressors(kept)
         left = _WANDERS * (1.0 - kept**2) + 1.0 - _WANDERS
         return self._mean @ by, by @ self._covariance @ by + left * self.noise
 
@@ -207,7 +210,7 @@ class FreeLevel:
         self._covariance[:, -1] *= kept
         self._covariance[:, :, -1] *= kept
         self._covariance[:, -1, -1] += _WANDERS * (1.0 - kept**2) * self.noise
-        by = lacking.by(1.0)
+        by = lacking.regressors(1.0)
         other = np.diag(lacking.doubtful)
         seen = self._covariance @ by
         white = (1.0 - _WANDERS) * self.noise

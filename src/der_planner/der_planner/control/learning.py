@@ -314,14 +314,14 @@ class Learner:
 
         def tip_of(limb: Limb) -> Array | None:
             try:
-                return self._of_file.of(limb).expected(first.commands).tip
+                return self._of_file.for_limb(limb).expected(first.commands).tip
             except (PlanningError, LimbError):
                 return None
 
         nearer = adapted(self._of_file.model.limb, tip_of, tip)
         if nearer is None:
             return self._seen_by_model(first), ""
-        self._correction = self._of_file.of(nearer)
+        self._correction = self._of_file.for_limb(nearer)
         return self._seen_by_model(first), _ADAPTED
 
     def _seen_by_model(self, run: PlayedRun) -> PlayedRun:

@@ -142,7 +142,7 @@ class TouchSense:
         away, variance = self._away(lacking, self.free, self._learned)
         distance = self._distance(away, away.covariance)
         touched = distance > (_RELEASED if before.touched else 1.0)
-        if touched and self._lets_go(lacking, variance):
+        if touched and self._return_to_earlier_level(lacking, variance):
             away, variance = self._away(lacking, self.free, self._learned)
             distance, touched = self._distance(away, away.covariance), False
         if distance < _RELEASED:
@@ -157,7 +157,7 @@ class TouchSense:
             self._noticed = lacking.covariance
         told = weighed = False
         if touched and self._has_weight:
-            told, weighed = self._weighs(away, lacking.time - since)
+            told, weighed = self._weigh(away, lacking.time - since)
         payload = self.free.payload
         if touched and not told:
             found = locate(self._model, away, self._places)
@@ -222,8 +222,8 @@ class TouchSense:
         whole = away.value @ np.linalg.solve(away.covariance, away.value) / self.threshold
         return max(distance, float(whole)) > _RELEASED * _SUSPECTED
 
-    def _lets_go(self, lacking: Lacking, variance: Array) -> bool:
-        """Return whether an earlier free level explains the limb better, and go back to that.
+    def _return_to_earlier_level(self, lacking: Lacking, variance: Array) -> bool:
+        """Go back to an earlier free level if that explains the limb better; return whether.
 
         A force that had been learned has ended, or a payload is off. The noise is that of the
         newest level: one of which little is known would explain any touch.
@@ -262,10 +262,10 @@ class TouchSense:
         driven = abs(float(change @ (last.effective - first.effective)))
         return float(change @ change) > _FASTER * driven
 
-    def _weighs(self, away: Lacking, age: float) -> tuple[bool, bool]:
+    def _weigh(self, away: Lacking, age: float) -> tuple[bool, bool]:
         """Return whether what touches is a payload, and whether it may yet turn out to be one.
 
-        What is told to be one belongs to the free level.
+        What is told to be one is added to the payload of the free level.
 
         Args:
             away: from the free level, with the covariance of that.

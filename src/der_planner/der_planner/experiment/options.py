@@ -28,7 +28,7 @@ from der_planner.planning.motions import (
     JOINT_MOTIONS,
 )
 from der_planner.planning.motions import NAMES as MOTIONS
-from der_planner.planning.planner import followed
+from der_planner.planning.planner import reference_and_configuration
 from pressure_driver.protocols import NAMES as BOARDS
 
 MODELS = tuple(METHODS_BY_MODEL)
@@ -221,7 +221,8 @@ class Options:
             elif self.obstacles:  # only a plan tells whether there is a way past them
                 plan(limb, motion, model, self.method, obstacles=self.in_the_way)
             else:
-                followed(motion, rod, rod if model == "der" else Model.of(limb, model), None)
+                body = rod if model == "der" else Model.of(limb, model)
+                reference_and_configuration(motion, rod, body, None)
 
     def other_twin(self, limb: Limb) -> str:
         """Return a sentence where the limb file is of another twin than a trial's; else empty."""

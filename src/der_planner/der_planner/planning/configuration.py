@@ -81,7 +81,7 @@ class Configuration(ABC):
         """Return the bend angles (…, M) [rad] at instants (…,) [s]."""
         return sample_spline(self.bend, time)[0]
 
-    def on(self, model: Model) -> Configuration:
+    def with_model(self, model: Model) -> Configuration:
         """Return the same motion for the model of another limb with as many segments."""
         other = copy.copy(self)
         other.model = model

@@ -78,14 +78,14 @@ class Correction:
         self._plan = plan
         self._configuration = configure(plan.body, plan.reference)
 
-    def of(self, limb: Limb) -> Correction:
+    def for_limb(self, limb: Limb) -> Correction:
         """Return the same with another limb's model; its plans still name the plan's own limb.
 
         Args:
             limb: with as many segments.
         """
         other = copy.copy(self)
-        other._configuration = self._configuration.on(self.model.another(limb))
+        other._configuration = self._configuration.with_model(self.model.another(limb))
         return other
 
     @property

@@ -96,11 +96,13 @@ def plan(
     with _THREADS.limit(limits=1, user_api="blas"):
         rod = RodModel(limb, nodes)
         body = rod if model == "der" else Model.of(limb, model)
-        reference, configuration = followed(motion, rod, body, start)
+        reference, configuration = reference_and_configuration(motion, rod, body, start)
         led = ""
         if obstacles is not None:
             rounds = _ROUNDS if model == "der" and method == "optimal" else 0
-            configuration, led, reference = _past(obstacles, rod, configuration, reference, rounds)
+            configuration, led, reference = _led_past(
+                obstacles, rod, configuration, reference, rounds
+            )
         bend = configuration.bend_at(reference.time)
         report(0.3)
         try:
@@ -141,7 +143,7 @@ def plan(
     )
 
 
-def followed(
+def reference_and_configuration(
     motion: Motion, rod: RodModel, body: Model, start: Start | None
 ) -> tuple[Reference, Configuration]:
     """Return a motion's reference, and the configuration of a model along it.
@@ -180,7 +182,7 @@ def _solve(
     return Optimum(commands, tip_under(configuration, commands), 0, int(cut > _NOTABLE_CUT))
 
 
-def _past(
+def _led_past(
     obstacles: Obstacles,
     rod: RodModel,
     configuration: Configuration,
