@@ -1,20 +1,21 @@
 """How much of feedback's corrections is worth sending: what they have brought, in hindsight.
 
-A share α of the corrections c that the horizon wants is sent. It has moved the tip by e_α; all of
-them would have moved it by e. Without any, the tip less r̄ would have been the measured one less
-e_α, and the share that would have left least of it is
+The horizon wants corrections, and a share α of them is sent. What was sent has moved the tip by
+e_α; all that was wanted would have moved it by e. With the measured tip and its reference r̄, the
+error without corrections would have been tip − r̄ − e_α. The share that would have left least of it
+is
 
     α = − Σ (tip − r̄ − e_α)·e / (Σ e² + P)
 
-over what was seen until now, older instants counting less. This is an estimate: its standard
-deviation follows from what that share would have left, and from how many of the instants are
-independent. Some standard deviations are taken off, and α stays within 0 … 1. Nothing is sent on
-trust: P keeps α at zero until something was seen.
+The sums are over what was seen until now; older instants count less. P is small, and keeps α at
+zero until something was seen. The standard deviation of this estimate follows from what α would
+have left, and from how many instants are independent. Some standard deviations are taken off, and
+the result is kept within 0 … 1.
 
-e is that of a limb that follows its pressures without swinging, since statics are calibrated.
-Swings are smoothed away on both sides. Where a disturbance changes faster than it can be seen and
-made up for, or where corrections bend the limb otherwise than the model, they come in the wrong
-phase: α falls, and the plan is left alone.
+e and e_α are those of a limb that follows its pressures without swinging, since statics are
+calibrated. Swings are smoothed away on both sides. Where a disturbance changes faster than it can
+be seen and made up for, or where corrections bend the limb otherwise than the model, they come in
+the wrong phase: α falls, and the plan is left alone.
 """
 
 from __future__ import annotations
@@ -34,22 +35,32 @@ _FORGET = 20.0
 _INDEPENDENT = 0.8
 """Time after which an instant says something new of the share [s]."""
 _DEVIATIONS, _DEVIATIONS_QUICK = 2.0, 3.0
-"""Number of its standard deviations that are taken off the share, and how many more in a quick
-motion: there what a correction brings differs most from one second to the next."""
+"""Standard deviations of the share that are taken off it, and those that a quick motion adds.
+
+In a quick motion what a correction brings differs most from one second to the next.
+"""
 _RISES, _RISES_QUICK = 1.5, 3.0
-"""Time in which the share may rise from none to all, and how much longer that takes in a quick
-motion: a sudden correction makes a limb swing [s]."""
+"""Time in which the share may rise from 0 to 1, and the time that a quick motion adds [s].
+
+A sudden correction makes a limb swing.
+"""
 _QUICK = 0.8
-"""Root mean square rate of a motion, over that of its bend, from which on it is quick [1/s]."""
+"""Root mean square of a quick motion's bend rates, over that of its bend from the mean [1/s]."""
 _OUTLYING = 9.0
-"""An instant counts as much as one that leaves so many times the usual squared error, at most."""
+"""Largest squared error that an instant counts with, over the usual one."""
 _LEAST_SLOW = 0.1
-"""Added to how slow two motions are before they are compared."""
+"""Slowness, 0 … 1, that is added to that of two motions before they are divided."""
 _LEAVES = 0.25
-"""Share of a plan's largest bend, from where it begins, at which earlier runs count: a limb that
-has rested sticks as it does nowhere else, and a correction that grows meanwhile throws it."""
+"""Share of the largest bend, both from where the plan begins, from which on earlier runs count.
+
+A limb that has rested sticks there as it does nowhere else. A correction that grew meanwhile would
+make it jump once it comes loose.
+"""
 _DOUBT = 0.001
-"""√(P / 1 s), over the limb's length."""
+"""√P over the limb's length [√s].
+
+What corrections bring counts once it would have moved the tip by about so much for a second.
+"""
 
 
 class Benefit:

@@ -57,7 +57,10 @@ _TRAVEL = 1e-5
 _PRESSURE = 1e-4
 """Weight of (pressure over its limit)² [m²] that decides between equally near courses."""
 _WEAKEST = 0.08
-"""Tip over angle, as a share of the limb's length, where smoothing takes over from following."""
+"""Movement of the tip per radian of bend, over the limb's length.
+
+Where the tip moves less, waves of `TIMED_WAVE` are smoothed rather than followed.
+"""
 _EXCESS = 1.0
 """Weight of what is beyond a limit, relative to it [m]."""
 _ITERATIONS = 60
