@@ -95,8 +95,12 @@ def run(module: str) -> NoReturn:
     What is installed in the workspace can be imported only inside it, so an entry point names its
     module instead of importing it.
     """
-    enter()
-    sys.exit(importlib.import_module(module).main())
+    try:
+        enter()
+        command = importlib.import_module(module).main
+    except KeyboardInterrupt:
+        sys.exit(130)
+    sys.exit(command())
 
 
 def main() -> int:

@@ -179,9 +179,13 @@ class DriverCore:
         return result
 
     def vent(self) -> tuple[bool, str]:
-        """Open all chambers and refuse setpoints until armed again."""
-        result = self.machine.vent(self.clock())
+        """Open all chambers and refuse setpoints until armed again; returns whether it is heard."""
+        now = self.clock()
+        result = self.machine.vent(now)
         self._note_mode()
+        if unheard := self._link_fault or self.monitor.silence(now):
+            said = "the chambers may keep their pressures, close the valve at the air supply"
+            return False, f"{said}: {unheard}"
         return result
 
     def offer(self, setpoint: Setpoint, wall: int, origin: Origin | None = None) -> Verdict:

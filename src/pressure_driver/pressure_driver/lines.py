@@ -329,7 +329,7 @@ class BoardSocket:
         """Return the descriptors to wait for."""
         return [each.fileno() for each in (self._server, self._host) if each is not None]
 
-    def read(self, now: int, clock: Callable[[], int] | None = None) -> bool:  # noqa: ARG002
+    def read(self, now: int) -> bool:
         """Take what the host has sent, as of now [ns]; nobody restarts a board in a network."""
         with contextlib.suppress(BlockingIOError):
             while self._server is not None:

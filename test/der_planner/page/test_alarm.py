@@ -97,6 +97,11 @@ def test_a_fault_and_a_lost_operator_are_told(situation: Situation) -> None:
     situation.put_driver(state(PressureState.FAULT, faults=["supply too low"]))
     (alarm,) = alarms(situation)
     assert "after a fault: supply too low. The limb is without pressure" in alarm["text"]
+    # Old readings say nothing of the limb, nor that it was vented.
+    situation.put_driver(state(PressureState.FAULT, 9_000.0, faults=["pulled"], telemetry_age=0.9))
+    (alarm,) = alarms(situation)
+    assert "cannot reach the board: pulled. The limb may keep its pressures" in alarm["text"]
+    assert alarm["advice"].startswith("close the valve at the air supply")
     situation.put_driver(state(PressureState.DISARMED))
     situation.put_status(status("/limb/pressure_driver", lost_operator="page"))
     (alarm,) = alarms(situation)

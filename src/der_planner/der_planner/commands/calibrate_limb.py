@@ -10,8 +10,8 @@
 --offline plays the calibration on the twin in one process, in seconds. --graph plays it in real
 time on the running graph, on the twin or the hardware, records a bag, vents, and fits to the bag:
 about four minutes. A log is a table or a bag of any run that excites every input; its last quarter
-is kept back to judge the fit, unless there is --held-out or --weight. `--excitation FILE.csv` writes
-the pressures of the calibration run, and `--play FILE.csv` plays such a file instead.
+is kept back to judge the fit, unless there is --held-out or --weight. `--excitation FILE.csv`
+writes the pressures of the calibration run, and `--play FILE.csv` plays such a file instead.
 
 --mounting says how the limb was mounted in the log, --payload what it carried beside its own
 masses: the payload belongs to the log and does not enter the limb file. --mass is what a scale

@@ -65,7 +65,7 @@ from der_planner.results.report import instrument_table
 
 Kept = list[tuple[Trial, dict[str, Any]]]
 """Finished runs, each with what the ledger holds of it."""
-FAILURES = (GraphError, NodeError, PlanningError, LearningError, LogError)
+FAILURES = (GraphError, NodeError, PlanningError, LearningError, LogError, OSError)
 """What may end an experiment before its last trial."""
 
 
@@ -92,6 +92,8 @@ def _main() -> int:
             progress.say("done; the page stays with the report until Ctrl-C")
         except FAILURES as error:
             progress.fail(f"{error}; the page stays until Ctrl-C")
+        if not page.alive:
+            progress.say(f"warning: {page.failure('died')}")
         with contextlib.suppress(KeyboardInterrupt):
             while page.alive:
                 time.sleep(0.5)

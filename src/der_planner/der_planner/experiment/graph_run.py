@@ -230,14 +230,20 @@ class RunningGraph:
                 told of the plan meanwhile.
 
         Raises:
-            GraphError: the driver reports a fault, or the chambers do not vent.
+            GraphError: the driver reports a fault, the recorder has stopped, or the chambers do not
+                vent.
             NodeError: a node has died.
         """
 
         def finished() -> bool:
             state = self.client.newest.get(topics.PRESSURE_STATE)
             if state is not None and state.mode == PressureState.FAULT:
-                raise GraphError(f"the driver vented: {'; '.join(state.faults) or 'fault'}")
+                raise GraphError(
+                    f"the driver is in FAULT: {'; '.join(state.faults) or 'no reason'}"
+                )
+            if self.client.diagnostic_values("recorder").get("state") == "failed":
+                said = self.client.diagnostics["recorder"].message
+                raise GraphError(f"the recorder has stopped: {said}")
             feed()
             played = self.client.node.get_clock().now().nanoseconds * 1e-9 - begin
             self.progress.bar(min(played, length), length, "played")

@@ -11,6 +11,10 @@ SUPPLY = "close the valve at the air supply"
 """What is left where no program can vent the limb."""
 PRESSED = 1.0
 """A limb counts as under pressure from this differential pressure [kPa] on."""
+UNHEARD = 0.5
+"""Readings that are older than this [s] say nothing of what the chambers hold now."""
+LATE = 1.6
+"""A node counts as late after this time [s] without diagnostics, which it sends once a second."""
 NODES = {
     "pressure_driver": "nothing watches the pressures of the limb",
     "planner": "no motion can be asked for",
@@ -94,10 +98,10 @@ def alarms(snapshot: dict[str, Any]) -> list[Alarm]:
 
 
 def _between_runs(own: dict[str, dict[str, Any]]) -> bool:
-    """Tell whether an experiment will start the driver, which has not run or was ended in order."""
+    """Tell whether an experiment starts the driver, which has not run or has ended in order."""
     driver, experiment = own.get(DRIVER), own.get("experiment")
     waits = driver is None or driver["state"] == "ended"
-    return waits and experiment is not None and experiment["state"] == "ok"
+    return waits and experiment is not None and experiment["state"] in ("ok", "error")
 
 
 def _of_driver(snapshot: dict[str, Any], node: dict[str, Any] | None) -> Iterator[Alarm]:
@@ -113,14 +117,19 @@ def _of_driver(snapshot: dict[str, Any], node: dict[str, Any] | None) -> Iterato
         told = "The driver has been ended in order, and has vented the limb"
         yield Alarm("notice", told, None, "start it again: " + start_of(DRIVER, node))
         return
-    if dead or not source["fresh"]:
+    if dead or source["age"] > LATE:
         yield Alarm("danger", *_silence(source, driver, node))
         return
     limb = describe_limb(driver)
     if driver["mode"] == "fault":
         faults = "; ".join(driver["faults"]) or "no reason given"
-        told = f"The driver has vented after a fault: {faults}. The limb is {limb}"
-        yield Alarm("danger", told, None, "remove the cause, then arm")
+        age, advice = driver["telemetry_age"], "remove the cause, then arm"
+        if age is not None and age < UNHEARD:
+            told = f"The driver has vented after a fault: {faults}. The limb is {limb}"
+        else:
+            told = f"The driver cannot reach the board: {faults}. The limb may keep its pressures"
+            advice = f"{SUPPLY}; then {advice}"
+        yield Alarm("danger", told, None, advice)
     elif node is not None and (lost := node["values"].get("lost_operator", "none")) != "none":
         told = f"The operator was lost ({lost}): the driver stopped the limb, which is {limb}"
         yield Alarm("notice", told, None, "arm to go on")
@@ -158,21 +167,23 @@ def _of_touch(snapshot: dict[str, Any], planner: dict[str, Any] | None) -> Itera
     """Yield what touches the limb, or that the limb was vented for it."""
     contact, driver, sources = snapshot["contact"], snapshot["driver"], snapshot["sources"]
     reason = planner["values"].get("reason", "") if planner is not None else ""
-    rests = sources["driver"]["fresh"] and driver["mode"] == "disarmed"
-    if contact is not None and contact["touched"] and sources["contact"]["fresh"]:
+    heard = sources["driver"]["fresh"]
+    if heard and contact is not None and contact["touched"] and sources["contact"]["fresh"]:
         told = f"Something touches the limb: {contact['said']}"
         yield Alarm("notice", told, None, "look at the limb, and vent it where that must not be")
-    elif reason.startswith(TOUCHED) and rests:
+    elif reason.startswith(TOUCHED) and heard and driver["mode"] in ("venting", "disarmed"):
         yield Alarm("danger", f"The limb was vented: {reason}", None, "free the limb, then arm")
 
 
 def _of_nodes(own: dict[str, dict[str, Any]]) -> Iterator[Alarm]:
     """Yield the other nodes of this limb that are dead, and an experiment that has failed."""
-    if (experiment := own.get("experiment")) and experiment["state"] == "error":
-        yield Alarm("danger", f"The experiment has stopped: {experiment['message']}", None, "")
+    experiment = own.get("experiment")
+    if experiment is not None and experiment["state"] == "error":
+        told = f"The experiment has stopped: {experiment['message']}"
+        yield Alarm("danger", told, None, "see to it, then start it again with the same --out")
     for name, meaning in NODES.items():
         node = own.get(name)
         if name != DRIVER and node is not None and node["state"] == "dead":
             told = f"The {name} is dead: {_reason(node)}"
-            advice = f"start it again: {start_of(name, node)}"
+            advice = "" if experiment else f"start it again: {start_of(name, node)}"
             yield Alarm("danger", f"{told}; {meaning}" if meaning else told, node["age"], advice)

@@ -19,7 +19,7 @@ from rcl_interfaces.msg import Log
 
 from der_msgs.msg import LimbContact, LimbEstimate, LimbState, PressurePlan, PressureState
 from der_planner.limb import mounting_of
-from der_planner.page.alarm import NODES, alarms, describe_limb, missing, worst_first
+from der_planner.page.alarm import LATE, NODES, alarms, describe_limb, missing, worst_first
 from limb_interfaces.diagnostics import ENDED_IN_ORDER
 from limb_interfaces.stamps import NANOSECONDS, nanoseconds
 
@@ -29,8 +29,6 @@ GRAMS = 1000.0
 PERCENT = 100.0
 FRESH = {"driver": 0.5, "tracker": 0.5, "camera": 0.7, "estimate": 0.5, "contact": 0.5}
 """The newest message of a source may be this old [s] before the page greys it."""
-LATE = 1.6
-"""A node counts as late after this time [s] without diagnostics, which it sends once a second."""
 DEAD = 5.0
 """A node counts as dead after this time [s] without diagnostics."""
 ENDED, STOPPED = "its process has ended", "its process is stopped"
@@ -40,7 +38,7 @@ MODES = {
     "tracking": "moves",
     "holding": "keeps its pressures",
     "venting": "lets its pressures down",
-    "fault": "vented: something failed",
+    "fault": "told to vent: something failed",
 }
 """The driver's modes, in the order of their numbers, and what each means for the limb."""
 SILENT = "silent"

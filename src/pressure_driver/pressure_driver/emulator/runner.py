@@ -6,7 +6,6 @@ The port has a stable name and a baud rate, and can be unplugged.
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import fcntl
 import math
 import os
@@ -33,50 +32,8 @@ AIR_PERIOD = 20_000_000
 LONGEST_STEP = 0.1
 """[s] by which the board's time advances at once: when this process stands still, or the wall clock
 is set, the board's watchdog does not run out meanwhile."""
-_IN_MODIFY = 0x2
-"""Of inotify: written to."""
 BITS_PER_BYTE = 10
 """Start bit, eight data bits, stop bit."""
-LONGEST_READ = 5_000_000
-"""[ns] between a wake and the end of its read, above which the bytes are of unknown age."""
-
-
-class LineTap:
-    """Tells at once of writes to a device; does nothing where there is no inotify.
-
-    The kernel hands bytes to the other end of a pseudo-terminal by a worker of ordinary priority,
-    which on busy cores comes milliseconds later; a real serial port begins to send at once. The
-    event of inotify is raised within the host's own write.
-
-    Args:
-        device: path of the host's end of a pseudo-terminal.
-    """
-
-    def __init__(self, device: str) -> None:
-        self.descriptor = -1
-        """Becomes readable with a write; −1 where there is none."""
-        library = ctypes.CDLL(None, use_errno=True)
-        descriptor = library.inotify_init1(os.O_NONBLOCK | os.O_CLOEXEC)
-        if descriptor < 0:
-            return
-        if library.inotify_add_watch(descriptor, os.fsencode(device), _IN_MODIFY) < 0:
-            os.close(descriptor)
-            return
-        self.descriptor = descriptor
-
-    def take(self) -> bool:
-        """Return whether there has been a write since the last call."""
-        if self.descriptor < 0:
-            return False
-        with contextlib.suppress(BlockingIOError):
-            return bool(os.read(self.descriptor, 4096))
-        return False
-
-    def close(self) -> None:
-        """Stop watching."""
-        if self.descriptor >= 0:
-            os.close(self.descriptor)
-            self.descriptor = -1
 
 
 class EmulatedPort:
@@ -131,7 +88,6 @@ class EmulatedPort:
         device = os.ttyname(slave)
         os.close(slave)
         os.set_blocking(master, False)
-        self._tap = LineTap(device)
         temporary = self.link.with_name(f"{self.link.name}.{os.getpid()}")
         temporary.symlink_to(device)
         temporary.replace(self.link)
@@ -144,37 +100,21 @@ class EmulatedPort:
         with contextlib.suppress(OSError):
             self.link.unlink()
         os.close(self._master)
-        self._tap.close()
         self._master = None
         self.host_present = False
         self._outgoing.clear()
         self._incoming.clear()
 
     def watched(self) -> list[int]:
-        """Return the descriptors to wait for; empty while no host has the port open.
+        """Return the descriptors to wait for; empty while no host has the port open."""
+        return [] if self._master is None or not self.host_present else [self._master]
 
-        Where writes can be tapped, the terminal itself is left out: waiting for it would wait for
-        the kernel's worker as well.
-        """
-        if self._master is None or not self.host_present:
-            return []
-        return [self._tap.descriptor if self._tap.descriptor >= 0 else self._master]
-
-    def read(self, now: int, clock: Callable[[], int] | None = None) -> bool:
-        """Take what the host has sent.
-
-        Args:
-            now: [ns] wall clock when the wait ended: the arrival of bytes whose writing ended it.
-            clock: the wall clock, for the arrival of bytes that were not announced; ``now`` if
-                None.
-
-        Returns:
-            Whether a host has just opened the port.
+    def read(self, now: int) -> bool:
+        """Take what the host has sent, as of now [ns]; return whether it has just opened the port.
         """
         if self._master is None:
             return False
         was_present = self.host_present
-        announced = self._tap.take()
         try:
             data = os.read(self._master, 4096)
             self.host_present = True
@@ -185,12 +125,7 @@ class EmulatedPort:
             self.host_present = False
             self._outgoing.clear()
             return False
-        arrival = now
-        if clock is not None:
-            after = clock()
-            # If this thread was kept waiting since, bytes may have come after the announced ones.
-            arrival = now if announced and after - now < LONGEST_READ else after
-        first = max(arrival, self._line_free)
+        first = max(now, self._line_free)
         self._line_free = first + len(data) * self._byte_time
         self._incoming.append((self._line_free, first, data))
         return not was_present
@@ -339,7 +274,7 @@ class BoardRunner:
                 self.port.send(self._delayed.popleft()[1])
 
     def _serve_line(self, now: int) -> None:
-        if self.port.read(now, time.time_ns) and self._reset_on_open:
+        if self.port.read(now) and self._reset_on_open:
             self.port.send(self.board.boot())
         for stamp, data in self.port.arrived(now):
             commands, answer = self.board.receive(data, stamp)
