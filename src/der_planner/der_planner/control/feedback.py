@@ -43,6 +43,8 @@ _AHEAD = 10.0
 """Instants so far beyond the newest command are of another clock, or in another unit [s]."""
 _LONGEST = 1e5
 """So are those further from the first setpoint [s]."""
+_UNHEARD = 0.3
+"""Time without a reading of the chambers after which a picture tells of no touch [s]."""
 _FILLED = 0.1
 """Command from which on chambers must hold something, as a share of the limb's pressure limit."""
 
@@ -227,9 +229,10 @@ class Feedback:
         return command
 
     def _feel(self) -> None:
-        """Look at what the newest picture says of a touch."""
+        """Look at what the newest picture says of a touch, if it is known what chambers held."""
         time = self._estimator.newest
-        if np.isfinite(time) and time > self._sense.newest.time:
+        unheard = _UNHEARD < time - self._chambers.newest < np.inf
+        if np.isfinite(time) and time > self._sense.newest.time and not unheard:
             self._sense.feel(time, self._nominal, self._estimator.at(time))
 
     def allowed(self, command: Array) -> Array:

@@ -44,6 +44,9 @@ class Reaction:
         kind: one of `KINDS`. `vent` holds, and says with `vents` that the limb is to be vented.
         limit: force that is allowed [N]; None: that of the plan.
 
+    Attributes:
+        vents: whether the limb is to be vented: one picture alone does not tell that.
+
     Raises:
         ValueError: another kind, or a limit that is no force.
     """
@@ -57,6 +60,7 @@ class Reaction:
                 f"with {kind}"
             )
         self.kind, self.limit = kind, limit
+        self.vents = False
         self._held: Array | None = None
         self._bound = np.zeros(model.inputs), 0.0
         self._free, self._kept = 1.0, np.zeros(model.inputs)
@@ -66,11 +70,6 @@ class Reaction:
     def acts(self) -> bool:
         """Whether it may change commands."""
         return self.kind != "warn"
-
-    @property
-    def vents(self) -> bool:
-        """Whether the limb is to be vented."""
-        return self.kind == "vent" and self._held is not None
 
     def follow(self, planned: Array, touch: Touch, chambers: Array) -> None:
         """Look at a touch, or that there is none, before a command is asked for.
@@ -82,6 +81,7 @@ class Reaction:
         """
         harder, bound = self._bound
         self._suspected = touch.suspected and self.acts
+        self.vents = self.kind == "vent" and touch.touched and touch.time > touch.since
         if not (touch.touched and self.acts):
             yields = self.kind == "yield" and self._held is not None
             if yields and self.limit is None and touch.suspected:
