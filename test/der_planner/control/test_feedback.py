@@ -142,22 +142,6 @@ def test_order_of_arrival_does_not_matter(planned):
     assert np.abs(answers[0].missing_pressure).max() > 10.0
 
 
-def test_a_push_dies_no_later(planned, corrected):
-    def swing(feedback: Feedback | None, before: Played) -> float:
-        plant = Chain()
-
-        def event(time: float) -> None:
-            plant.chain.push(LENGTH, (0.0, 0.3 if 4.0 <= time < 4.2 else 0.0))
-
-        after = play(planned, plant, feedback, event=event)
-        apart = np.linalg.norm(after.tip - before.tip, axis=1)
-        assert apart.max() > 0.01
-        return float(np.nonzero(apart > 0.2 * apart.max())[0][-1] * 0.05 - 4.2)
-
-    alone = swing(None, play(planned, Chain()))
-    assert swing(Feedback(planned), corrected[0]) <= alone
-
-
 def test_a_gain_that_drops_is_made_up_for(planned, corrected):
     plant = Chain()
 
@@ -204,10 +188,7 @@ def test_another_motion_takes_over_without_a_jump(planned):
     assert np.mean(errors) < 0.025 * LENGTH
 
 
-@pytest.mark.parametrize(("gain", "more", "error"), [(1.0, 0.15, 0.9), (0.8, 0.0, 1.0)])
-def test_the_next_run_remembers_what_corrections_bring_once_it_has_left_its_rest(
-    planned, gain, more, error
-):
+def test_the_next_run_remembers_what_corrections_bring_once_it_has_left_its_rest(planned):
     feedback, errors, shares = Feedback(planned), [], np.zeros((2, len(planned.time) + 1))
     for run, share in enumerate(shares):
         if run:
@@ -217,14 +198,12 @@ def test_the_next_run_remembers_what_corrections_bring_once_it_has_left_its_rest
         def event(time: float, share=share, feedback=feedback) -> None:
             share[int(20 * time + 1e-6)] = feedback.share
 
-        plant = Chain()
-        plant.chain.change_gain(gain)
-        errors.append(play(planned, plant, feedback, event=event).error.mean())
+        errors.append(play(planned, Chain(), feedback, event=event).error.mean())
     moved = planned.reference.bend_angles - planned.reference.bend_angles[0]
     leaves = int(np.argmax(np.abs(moved).max(axis=1) > 0.1))
     np.testing.assert_array_equal(shares[1, :leaves], shares[0, :leaves])
-    assert shares[1, 100] > shares[0, 100] + more
-    assert errors[1] < error * errors[0]
+    assert shares[1, 100] > shares[0, 100] + 0.15
+    assert errors[1] < 0.9 * errors[0]
 
 
 def test_lost_tags_lead_back_to_the_plan(planned):
@@ -241,11 +220,10 @@ def test_lost_tags_lead_back_to_the_plan(planned):
     assert correction[-1] > 100.0
 
 
-@pytest.mark.parametrize("gain", [0.1, (1.0, 0.0)])
-def test_correcting_a_limb_that_does_not_follow_does_no_harm(planned, gain):
+def test_correcting_a_limb_that_does_not_follow_does_no_harm(planned):
     plant, other = Chain(), Chain()
-    plant.chain.change_gain(gain)
-    other.chain.change_gain(gain)
+    plant.chain.change_gain(0.1)
+    other.chain.change_gain(0.1)
     corrected, alone = play(planned, plant, Feedback(planned)), play(planned, other)
     assert corrected.error.mean() < alone.error.mean()
 
@@ -282,20 +260,30 @@ def test_what_is_fast_in_corrections_that_swing_is_taken_off_and_the_rest_stays(
             assert np.ptp(sent[100:, 1]) < 0.4 * np.ptp(wanted)
 
 
-@pytest.mark.parametrize("force", [0.2, 0.3])
-def test_pushes_do_not_end_feedback(planned, force):
-    plant, feedback = Chain(), Feedback(planned)
+def test_pushes_do_not_end_feedback_and_die_no_later(planned, corrected):
+    def pushed(feedback: Feedback | None) -> Played:
+        plant = Chain()
 
-    def event(time: float) -> None:
-        pushed = 4.0 <= time < 4.2 or 7.0 <= time < 7.2
-        plant.chain.push(LENGTH, (0.0, force if pushed else 0.0))
+        def event(time: float) -> None:
+            pushed = 4.0 <= time < 4.2 or 8.0 <= time < 8.2
+            plant.chain.push(LENGTH, (0.0, 0.3 if pushed else 0.0))
 
-    played = play(planned, plant, feedback, event=event)
+        return play(planned, plant, feedback, event=event)
+
+    def swing(after: Played, before: Played) -> int:
+        """Return how many periods of the first push stand out."""
+        apart = np.linalg.norm(after.tip - before.tip, axis=1)[:160]
+        assert apart.max() > 0.01
+        return int(np.nonzero(apart > 0.2 * apart.max())[0][-1])
+
+    feedback = Feedback(planned)
+    played = pushed(feedback)
     assert not feedback.warnings
     assert feedback.share > 0.6
-    pushed = played.error[80:100].max()
-    assert pushed > 0.02
-    assert played.error[115:140].max() < 0.5 * pushed
+    largest = played.error[80:100].max()
+    assert largest > 0.02
+    assert played.error[115:140].max() < 0.5 * largest
+    assert swing(played, corrected[0]) <= swing(pushed(None), play(planned, Chain()))
 
 
 def test_commands_that_are_asked_for_too_late_end_feedback(planned):

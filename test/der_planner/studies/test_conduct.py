@@ -124,7 +124,7 @@ class Breaking(Progress):
 
 def test_a_cluster_that_breaks(tmp_path, cluster):
     """A worker is killed, then the scheduler is gone: nothing is lost, nothing is done again."""
-    study, out = Study.read(write(tmp_path, TWINS.format(count=9))), tmp_path / "out"
+    study, out = Study.read(write(tmp_path, TWINS.format(count=6))), tmp_path / "out"
     with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as doomed:
         settings = PlaySettings(out, doomed.scheduler_address)
         with pytest.raises(StudyError, match=r"scheduler is gone.*same command goes on from here"):
@@ -161,10 +161,10 @@ def test_a_stopped_study_goes_on(tmp_path, cluster):
     subprocess.run([*command, *more], check=True, timeout=600)
     stopped = by_key(out)
     assert {row.key for row in study.rows[:5]} <= set(stopped)
-    for row in study.rows[:5:2]:
-        outcome = compute("run", row.values, "")
-        for column in study.keep:
-            assert stopped[row.key][column] == outcome.results[column]
+    row = study.rows[4]
+    outcome = compute("run", row.values, "")
+    for column in study.keep:
+        assert stopped[row.key][column] == outcome.results[column]
     assert "<h1>Study small</h1>" in (out / "report" / "report.html").read_text()
 
 
