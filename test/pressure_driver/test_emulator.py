@@ -150,29 +150,6 @@ def test_the_port_paces_bytes_both_ways(tmp_path):
         port.close()
 
 
-def test_bytes_are_stamped_when_the_host_writes_them(tmp_path):
-    port = EmulatedPort(str(tmp_path / "board"), 0)
-    host = open_host(port)
-    try:
-        port.read(1)
-        os.write(host, b"first")
-        assert select.select(port.watched(), [], [], 10.0)[0]
-        port.read(1000, lambda: 5000)
-        while not (got := port.arrived(10**9)):
-            port.read(2000, lambda: 6000)
-        if port._tap.descriptor >= 0:
-            assert got == [(1000, b"first")]
-        # The announcement is used up: bytes without one are stamped when they are read.
-        os.write(host, b"second")
-        port._tap.take()
-        while not (got := port.arrived(10**9)):
-            port.read(7000, lambda: 8000)
-        assert got == [(8000, b"second")]
-    finally:
-        os.close(host)
-        port.close()
-
-
 def test_the_port_overwrites_no_file_and_takes_no_link_from_another_emulator(tmp_path):
     (tmp_path / "file").write_text("precious")
     with pytest.raises(FileExistsError, match="port_link"):

@@ -18,7 +18,6 @@ import socket
 import struct
 import termios
 import time
-from collections.abc import Callable
 from typing import Any
 from urllib.parse import urlsplit
 

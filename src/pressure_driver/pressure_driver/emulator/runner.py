@@ -110,8 +110,7 @@ class EmulatedPort:
         return [] if self._master is None or not self.host_present else [self._master]
 
     def read(self, now: int) -> bool:
-        """Take what the host has sent, as of now [ns]; return whether it has just opened the port.
-        """
+        """Take what the host has sent, as of now [ns]; return whether it just opened the port."""
         if self._master is None:
             return False
         was_present = self.host_present
