@@ -24,6 +24,8 @@ Lengths = tuple[float, ...]
 Stretches = tuple[tuple[float, float], ...]
 """From and to in arc length [m]."""
 SCHEMA_VERSION = 1
+LONGEST = 5.0
+"""Length of a segment from which on it is told in another unit [m]."""
 
 UNIT_CORNERS = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
 """Corners of a tag of size 1 in its own frame: lower left, lower right, upper right, upper left."""
@@ -121,8 +123,10 @@ class LimbGeometry(ABC):
             raise MapError(f"'schema: {SCHEMA_VERSION}' expected at the top of the map")
         limb = section(data, "limb")
         lengths = tuple(floats(limb.get("segment_lengths"), None, "limb.segment_lengths"))
-        if not lengths or min(lengths) <= 0.0:
-            raise MapError("limb.segment_lengths: a list of positive lengths in m expected")
+        if not lengths or not 0.0 < min(lengths) <= max(lengths) < LONGEST:
+            raise MapError(
+                f"limb.segment_lengths: a list of lengths in m expected, each below {LONGEST:g} m"
+            )
         return cls._read(data, lengths, _stiff(limb.get("stiff") or [], lengths))
 
     @classmethod

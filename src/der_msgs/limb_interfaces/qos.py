@@ -46,8 +46,9 @@ IMAGES = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 SENSOR_DATA = qos_profile_sensor_data
 """A publisher of images and camera calibration."""
 
-POSES = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
-"""A subscriber of poses hears all publishers, and all bodies of a frame that come at once."""
+POSES = QoSProfile(depth=20, reliability=ReliabilityPolicy.BEST_EFFORT)
+"""A subscriber of poses hears all publishers, and all bodies of a frame that come at once; more
+would be frames of the past for a tracker that is too slow."""
 
 LEASES = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Signs of an operator: one that a network held up must not come later in place of a newer one."""

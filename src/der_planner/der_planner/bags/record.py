@@ -77,11 +77,13 @@ class Revisions:
         stamps: instants at which the revised setpoints take effect [ns].
         added: (M,) of each: the setpoint less the plan's [Pa].
         pictures: of each revision, the newest picture that it knows of [ns]; None: not told.
+        warnings: why feedback was out, each reason once.
     """
 
     stamps: list[int] = field(default_factory=list)
     added: list[Array] = field(default_factory=list)
     pictures: list[int | None] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
 
     def revised(self, stamp: int, added: Array) -> None:
         """Add a revised setpoint."""
@@ -164,7 +166,10 @@ class LimbRecord:
     def add_estimate(self, message: Any) -> None:
         """Add a `LimbEstimate`."""
         picture = header_stamp(message) - round(message.age * NANOSECONDS)
-        self.revisions[message.plan_id].estimated(picture, np.asarray(message.correction))
+        revisions = self.revisions[message.plan_id]
+        revisions.estimated(picture, np.asarray(message.correction))
+        if message.reason and message.reason not in revisions.warnings:
+            revisions.warnings.append(message.reason)
 
     def add_contact(self, message: Any) -> None:
         """Add a `LimbContact`: of each touch the one that was surest."""

@@ -99,7 +99,8 @@ def run_of(record: BagRecord, namespace: str, plan_id: str = "") -> RunSeries:
     feedback = {}
     if revisions.stamps:
         added = commands - planned_commands(plan)
-        feedback = {"feedback": described(added, latencies(revisions, limb.seen()))}
+        told = described(added, latencies(revisions, limb.seen()))
+        feedback = {"feedback": {**told, "warnings": revisions.warnings}}
     end = times[-1]
     played = int(setpoints.index[-1]) if len(setpoints.index) else len(times) - 1
     faults = [text for when, text in limb.faults if 0 <= (when - origin) / NANOSECONDS <= end]

@@ -203,7 +203,12 @@ def _parser() -> argparse.ArgumentParser:
         metavar="FILE",
         help="bags or tables to predict, not to fit",
     )
-    parser.add_argument("--out", type=Path, default=Path("limb.yaml"), help="limb file to write")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("limb.yaml"),
+        help="limb file to write (default: limb.yaml)",
+    )
     parser.add_argument("--report", type=Path, help="folder for report.txt and prediction.png")
     return parser
 

@@ -58,7 +58,7 @@ def _said(smoothed: Smoothed, run: RunSeries) -> list[str]:
     for i in range(size):
         missing, gain = smoothed.missing_pressure[:, i], smoothed.gain_error[:, i]
         lines.append(
-            f"segment {i + 1}: missing pressure {missing.mean():+.0f} Pa (from {missing.min():+.0f}"
+            f"segment {i}: missing pressure {missing.mean():+.0f} Pa (from {missing.min():+.0f}"
             f" to {missing.max():+.0f}), gain error {gain.mean():+.1%}"
         )
     if run.truth is not None:
@@ -82,7 +82,7 @@ def write_table(smoothed: Smoothed, path: Path) -> None:
     )
     for place, (name, unit, values) in enumerate(quantities):
         for i in range(size):
-            columns[f"{name}_{i + 1}{unit}"] = values[:, i]
-            columns[f"{name}_{i + 1}_sigma{unit}"] = smoothed.deviation[:, place * size + i]
+            columns[f"{name}_{i}{unit}"] = values[:, i]
+            columns[f"{name}_{i}_sigma{unit}"] = smoothed.deviation[:, place * size + i]
     table = np.column_stack(list(columns.values()))
     np.savetxt(path, table, delimiter=",", header=",".join(columns), comments="", fmt="%.9g")

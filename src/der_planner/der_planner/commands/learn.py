@@ -141,7 +141,13 @@ def plan_of(run: RunSeries, given: argparse.Namespace) -> Plan:
         )
     motion = Motion.named(told.motion, told.amplitude, told.period, told.cycles)
     in_the_way = Obstacles.from_yaml(given.obstacles) if given.obstacles else None
-    return plan(limb, motion, model=told.model, obstacles=in_the_way)
+    try:
+        return plan(limb, motion, model=told.model, obstacles=in_the_way)
+    except PlanningError as error:
+        raise PlanningError(
+            f"{error}. It was played: give the limb file that {told.title} was planned with, "
+            f"{told.limb or 'the default one'}"
+        ) from error
 
 
 def in_hindsight(

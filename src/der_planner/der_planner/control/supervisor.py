@@ -18,7 +18,7 @@ from der_planner.arrays import Array
 from der_planner.model import CONTROL_PERIOD
 
 REASONS = {
-    "tags lost": "the limb has not been seen for {:.1f} s",
+    "tags lost": "nothing newer than {:.1f} s has come of the limb: is it seen, and in time?",
     "inconsistent": "the limb moves as the model cannot, measurements are {:.0f} times too far "
     "off: is it this limb, does something hold it, and are they in rad, m and Pa, segment by "
     "segment from the clamp",

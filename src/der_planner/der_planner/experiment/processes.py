@@ -107,6 +107,10 @@ class Hardware:
                 raise OptionError(f"hardware file {path}: unknown key '{key}'; known: {known}")
         hardware = cls(**{key: value for key, value in content.items() if value is not None})
         hardware.hosts.update(_hosts(hardware, path))
+        named = {**hardware.tracker, **(hardware.poses or {}), **hardware.planner}
+        for key, file in named.items():
+            if key.endswith(("_map", "_file")) and file and not Path(file).exists():
+                raise OptionError(f"hardware file {path}: no file '{file}' ({key})")
         port = str(hardware.driver.get("port", ""))
         elsewhere = "pressure_driver" in hardware.hosts or port.startswith("tcp://")
         if hardware.twin is None and not elsewhere and not (port and Path(port).exists()):

@@ -69,6 +69,12 @@ STIFFER_STARTS = (0.0, 0.25, 0.5, 0.9)
 the log from there."""
 FARTHEST_WEIGHT = 1.5
 """Place of a known weight, over the prior's length, beyond which it is not in metres."""
+MISSED = 0.1
+"""Error that a fit leaves, over the range of bend angles, from which on it misses the log."""
+_MISSED = (
+    "the limb that fits the log best misses it: was it mounted and loaded as said (--mounting, "
+    "--payload), are units and columns right, and do angles and pressures have one clock?"
+)
 _NO_CUBIC = (
     "the cubic term is left out: with it the limb that fits the log best gives way under its "
     "pressures, since under gravity that term is hardly told from stiffness and rest angle"
@@ -169,6 +175,10 @@ def _fit(
         warnings.append(said)
     warnings += at_bounds(fitted.free, fitted.values)
     found = _calibrated(fitted, limb, air, recorded)
+    span = np.ptp(prepared.bend[prepared.usable], axis=0)
+    residual = np.sqrt(np.nanmean(fitted.remaining**2, axis=0))
+    if np.any(residual > MISSED * span):
+        warnings.append(_MISSED)
     warnings += filter(None, [nearly_buckling(found)])
     pcc_residual = np.full(limb.segment_count, np.nan)
     if limb.weighs_in_plane or any(term.group == "dynamics" for term in fitted.free.terms):
@@ -180,10 +190,10 @@ def _fit(
         correlation=correlation,
         air=air,
         geometry=fitted.lengths,
-        residual=np.sqrt(np.nanmean(fitted.remaining**2, axis=0)),
+        residual=residual,
         largest=np.nanmax(np.abs(fitted.remaining), axis=0),
         pcc_residual=pcc_residual,
-        span=np.ptp(prepared.bend[prepared.usable], axis=0),
+        span=span,
         duration=float(np.ptp(prepared.log.time)),
         rows=int(prepared.usable.sum()),
         delay=fitted.problem.delay(fitted.values),

@@ -30,6 +30,8 @@ LEAST_DURATION = 1.0
 """Duration below which it must, too [s]."""
 LEAST_MOTION = np.deg2rad(3.0)
 """Range of motion from which on gains are judged [rad]."""
+TOO_LARGE = 3.0
+"""Largest differential pressure, over the prior's limit, that is not taken for another unit."""
 ANOTHER_SIDE = math.radians(25.0)
 """Direction of the tips beside that of the bend angles above which their axes differ [rad]."""
 LONGEST_SWING = 12.0
@@ -329,7 +331,13 @@ def _check_commands(log: CalibrationLog) -> None:
 
 
 def _check_scale(pressure: Array, bend: Array, limb: Limb) -> None:
-    """Refuse pressures that are far too small for the bends that they go with."""
+    """Refuse pressures that are far too small for the bends that they go with, or too large."""
+    largest, limit = float(np.nanmax(np.abs(pressure))), limb.pneumatics.pressure_limit
+    if largest > TOO_LARGE * limit:
+        raise LogError(
+            f"pressures differ by up to {largest:.3g} Pa, the prior's limit is {limit:.0f} Pa: "
+            "name their unit in columns.yaml (pressure_unit), or give your limb's limit in --prior"
+        )
     driven = float((limb.static_gain * np.ptp(pressure, axis=0)).max())
     moved = float(np.ptp(bend, axis=0).max())
     if moved > LEAST_MOTION and driven < TOO_SMALL * moved:

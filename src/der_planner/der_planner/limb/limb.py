@@ -79,6 +79,7 @@ class Limb:
         "zeros for a limb that lies on a plate, [9.81, 0, 0] for one that hangs from its "
         "clamp, [0, 0, -9.81] for one that is level and free to sag out of its plane",
         default=(0.0, 0.0, 0.0),
+        interval="[-20, 20]",
     )
     calibrated: CalibratedRange = field(default_factory=CalibratedRange)
     provenance: Mapping[str, Any] = field(default_factory=dict)

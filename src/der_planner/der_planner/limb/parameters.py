@@ -30,7 +30,7 @@ class Segment:
         "m",
         "actuated length",
         "measure what bends; the calibration corrects it by the tip",
-        interval="(0, inf)",
+        interval="(0, 5]",
     )
     bending_stiffness: float = parameter(
         "N·m²",

@@ -284,7 +284,15 @@ class Motion:
             for _ in range(_SAG_ROUNDS):
                 short = workspace.arcs.tip(angles) - workspace.sagging_tips(time, angles)
                 angles = workspace.follow(time, tip + short, self.branch)
-        return (*with_transitions(workspace.fastest, time, angles, rest.bend_angles), None)
+        joined = with_transitions(workspace.fastest, time, angles, rest.bend_angles)
+        if _beyond(workspace, joined[1]) and not _beyond(workspace, angles):
+            ends = np.linalg.norm(np.gradient(tip, time, axis=0)[[0, -1]], axis=1)
+            raise PlanningError(
+                f"the path begins or ends in motion, at up to {ends.max():.2g} m/s: on the way "
+                "there or back the limb would swing beyond its reach. Let it begin and end "
+                "slower, or follow the nearest path (nearest=True; --nearest)"
+            )
+        return (*joined, None)
 
     def _nearest_motion(
         self, workspace: Workspace, path: paths.TipPath
@@ -298,8 +306,13 @@ class Motion:
             offset = (tips - workspace.arcs.tip(angles)).mean(axis=0)
             time, angles, deviation = nearest_path(workspace, path, offset, limits)
         joined = with_transitions(fastest, time, angles, home)
-        if np.any(joined[1] < workspace.low) or np.any(joined[1] > workspace.high):
+        if _beyond(workspace, joined[1]):
             # A transition that begins or ends in full motion near a limit would swing beyond it.
             time, angles, deviation = nearest_path(workspace, path, offset, limits, rest=True)
             joined = with_transitions(fastest, time, angles, home)
         return (*joined, deviation)
+
+
+def _beyond(workspace: Workspace, angles: Array) -> bool:
+    """Tell whether bend angles (K, M) [rad] leave what the limb reaches."""
+    return bool(np.any(angles < workspace.low) or np.any(angles > workspace.high))

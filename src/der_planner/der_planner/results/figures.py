@@ -241,7 +241,7 @@ def plot_pressures(runs: Sequence[RunSeries], folder: Path) -> list[Path]:
             for label, look in colours_of(members).items():
                 _draw_pressures(row, next(run for run in members if label_of(run) == label), look)
             for segment, axis in enumerate(row):
-                axis.set(xlabel="time [s]", ylabel=f"Δp, segment {segment + 1} [kPa]")
+                axis.set(xlabel="time [s]", ylabel=f"Δp, segment {segment} [kPa]")
             row[0].set_title(title)
         shared_legend(figure, [axes[0][0]])
         return save(figure, folder, "pressures")
@@ -272,11 +272,14 @@ def plot_learning(results: Sequence[RunResult], folder: Path) -> list[Path]:
         figure: Any = Figure(figsize=(PAGE if len(curves) > 1 else COLUMN, 2.2))
         axes = figure.subplots(1, len(curves), squeeze=False, sharey=True)[0]
         for axis, (motion, trials) in zip(axes, curves.items(), strict=True):
-            for errors in trials:
-                axis.semilogy(np.arange(len(errors)), np.array(errors) * CM, "o-", ms=3)
+            for model, errors in trials:
+                drawn = {"color": colour(model), "ls": DASHES.get(model, "-."), "marker": "o"}
+                values = np.array(errors) * CM
+                axis.semilogy(np.arange(len(errors)), values, ms=3, label=model.upper(), **drawn)
             axis.set(xlabel="runs learned from", title=motion.replace("_", " "))
             axis.xaxis.get_major_locator().set_params(integer=True)
             axis.yaxis.set_major_formatter("{x:g}")
             axis.yaxis.set_minor_formatter("{x:.2g}")
         axes[0].set_ylabel("mean tip error [cm]")
+        shared_legend(figure, axes)
         return save(figure, folder, "learning")

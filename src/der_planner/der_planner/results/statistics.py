@@ -249,8 +249,8 @@ def learned_from(method: str) -> int:
     return int(count) if name == LEARNED and count.isdigit() else 0
 
 
-def learning_curves(results: Sequence[RunResult]) -> dict[str, list[list[float]]]:
-    """Return by motion the mean errors [m] of each trial's runs, in the order of learning.
+def learning_curves(results: Sequence[RunResult]) -> dict[str, list[tuple[str, list[float]]]]:
+    """Return by motion the model and mean errors [m] of each trial's runs, in their order.
 
     Trials that were not learned from are left out.
     """
@@ -260,10 +260,10 @@ def learning_curves(results: Sequence[RunResult]) -> dict[str, list[list[float]]
         beside = result.method.partition("+")[2]
         key = (result.motion, result.model, result.trial, beside)
         trials.setdefault(key, {})[learned_from(result.method)] = result.mean_error_m
-    curves: dict[str, list[list[float]]] = {}
-    for (motion, *_), errors in trials.items():
+    curves: dict[str, list[tuple[str, list[float]]]] = {}
+    for (motion, model, *_), errors in trials.items():
         if max(errors) > 0 and 0 in errors:
-            curves.setdefault(motion, []).append([errors[k] for k in sorted(errors)])
+            curves.setdefault(motion, []).append((model, [errors[k] for k in sorted(errors)]))
     return curves
 
 
