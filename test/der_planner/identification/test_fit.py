@@ -189,6 +189,7 @@ def test_bad_logs_are_refused_by_what_is_wrong(log):
         "wrong way": replace(log, bend_angles=-q),
         "follow its command": replace(log, commanded_differential=u[::-1].copy()),
         "pressure_unit": replace(log, measured_differential=u * 1e-4),
+        "or give your limb's limit": replace(log, measured_differential=u * 6.9),
     }
     for match, bad in cases.items():
         with pytest.raises(LogError, match=match):
@@ -198,6 +199,12 @@ def test_bad_logs_are_refused_by_what_is_wrong(log):
         fit(one, log)
     with pytest.raises(LogError, match="unknown model term"):
         fit(limb, log, terms=("magic",))
+
+
+def test_a_fit_that_misses_its_log_says_so(log):
+    other = replace(log, bend_angles=np.roll(log.bend_angles, 20, axis=0))
+    _, report = fit(Limb.default(), other, terms=())
+    assert any("do angles and pressures have one clock?" in said for said in report.warnings)
 
 
 def test_excitation_stays_inside_its_amplitude_and_excites_each_input_alone():
