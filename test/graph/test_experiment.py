@@ -115,7 +115,7 @@ def test_an_interrupted_experiment_with_loads_and_feedback_vents_and_goes_on(exp
     dataclasses.replace(Limb.default(), calibrated=known).to_yaml(tmp_path / "level.yaml")
     words = (
         *("--models", "der", "--feedback", "--limb", tmp_path / "level.yaml"),
-        *("--mounting", "20", "--payload", "0.02", "--amplitude", "0.3", "--period", "10"),
+        *("--mounting", "20", "--payload", "0.02", "--amplitude", "0.3", "--period", "7"),
     )
     run = experiment(*words)
     run.wait_for_line("planned in")
