@@ -157,6 +157,15 @@ def test_nodes_that_were_ended_in_order_alarm_nobody(situation: Situation, clock
     assert [node["state"] for node in situation.snapshot()["nodes"]] == ["ended", "ended"]
 
 
+def test_a_recorder_that_has_stopped_alarms(situation: Situation) -> None:
+    situation.put_driver(state(PressureState.TRACKING))
+    failed = status("/limb/recorder")
+    failed.level, failed.message = b"\2", "fewer than 64 MiB are free"
+    situation.put_status(failed)
+    (alarm,) = alarms(situation)
+    assert alarm["text"] == "The recorder does not record: fewer than 64 MiB are free"
+
+
 def test_an_experiment_between_two_runs_alarms_nobody(situation: Situation, clock: Clock) -> None:
     situation.put_status(status("/limb/experiment"))
     assert alarms(situation) == []  # it calibrates: no driver has run yet

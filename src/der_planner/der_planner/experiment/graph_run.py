@@ -41,6 +41,8 @@ COMPARING = 20.0
 """Clocks of other computers are compared with the driver's for this long [s] at the most."""
 ELSEWHERE = 30.0
 """Nodes that somebody else starts are waited for this long [s]."""
+STARTED = 2.0
+"""The recorder has told this long [s] after the first setpoint that it records."""
 PORT_VENTS = 3.0
 """The process of a dead driver's port has vented the limb after this time [s]."""
 VENTED_PRESSURE = 1000.0
@@ -241,11 +243,12 @@ class RunningGraph:
                 raise GraphError(
                     f"the driver is in FAULT: {'; '.join(state.faults) or 'no reason'}"
                 )
-            if self.client.diagnostic_values("recorder").get("state") == "failed":
-                said = self.client.diagnostics["recorder"].message
-                raise GraphError(f"the recorder has stopped: {said}")
             feed()
             played = self.client.node.get_clock().now().nanoseconds * 1e-9 - begin
+            recorder = self.client.diagnostic_values("recorder").get("state", "recording")
+            if played > STARTED and recorder != "recording":
+                said = self.client.diagnostics["recorder"].message
+                raise GraphError(f"the recorder has stopped: {said}")
             self.progress.bar(min(played, length), length, "played")
             return bool(played >= length)
 

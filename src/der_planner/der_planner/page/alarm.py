@@ -176,11 +176,15 @@ def _of_touch(snapshot: dict[str, Any], planner: dict[str, Any] | None) -> Itera
 
 
 def _of_nodes(own: dict[str, dict[str, Any]]) -> Iterator[Alarm]:
-    """Yield the other nodes of this limb that are dead, and an experiment that has failed."""
+    """Yield other nodes of this limb that are dead, and what has failed of experiment or record."""
     experiment = own.get("experiment")
     if experiment is not None and experiment["state"] == "error":
         told = f"The experiment has stopped: {experiment['message']}"
         yield Alarm("danger", told, None, "see to it, then start it again with the same --out")
+    recorder = own.get("recorder")
+    if recorder is not None and recorder["state"] == "error":
+        told = f"The recorder does not record: {recorder['message']}"
+        yield Alarm("danger", told, None, "see to it, then begin the recording again")
     for name, meaning in NODES.items():
         node = own.get(name)
         if name != DRIVER and node is not None and node["state"] == "dead":
