@@ -22,9 +22,9 @@ BEFORE = 12
 """Rows before a fill that belong to it."""
 
 
-def record(wiring: Wiring, seed: int) -> RigLog:
+def record(seed: int) -> RigLog:
     """Play a check on the twin, in simulated time."""
-    run, limb = check_run(), OfflineTwin(seed, wiring=wiring)
+    run, limb = check_run(), OfflineTwin(seed)
     random = np.random.default_rng(seed)
     measured, places = [], []
     for command in run.differential_pressure:
@@ -50,7 +50,7 @@ def record(wiring: Wiring, seed: int) -> RigLog:
 
 @pytest.fixture(scope="module")
 def straight() -> RigLog:
-    return record(Wiring((1, 2, 3, 4)), seed=3)
+    return record(seed=3)
 
 
 def rows_of(fill: int) -> slice:

@@ -13,7 +13,6 @@ from der_planner.limb import PointMass
 from der_planner.model.air import pair_of
 from der_planner.twin.body import Push, TwinError
 from der_planner.twin.limb_twin import LimbTwin
-from der_planner.twin.wiring import Wiring
 from pressure_driver.emulator.pneumatics import BoardPneumatics
 
 FINE_STEP = 0.01
@@ -50,7 +49,6 @@ class OfflineTwin:
         segment_count: M.
         gravity: (3,) acceleration in `limb_base` [m/s²].
         masses: what the limb carries from the start beside its own mass.
-        wiring: which chamber each valve fills; None: as everybody expects.
 
     Attributes:
         pneumatics, twin: the two of it.
@@ -67,11 +65,8 @@ class OfflineTwin:
         segment_count: int = 2,
         gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
         masses: Iterable[PointMass] = (),
-        wiring: Wiring | None = None,
     ) -> None:
-        self._wiring = wiring
-        hoses = [abs(chamber) - 1 for chamber in wiring.chambers] if wiring else None
-        self.pneumatics = BoardPneumatics(segment_count, seed, hoses)
+        self.pneumatics = BoardPneumatics(segment_count, seed)
         atmosphere = self.pneumatics.atmosphere
         self.twin = LimbTwin(seed, run, atmosphere=atmosphere, gravity=gravity, masses=masses)
         if self.twin.segment_count != segment_count:
@@ -104,10 +99,7 @@ class OfflineTwin:
         """Let time pass [s] under the last command."""
         count = max(1, int(np.ceil(duration / FINE_STEP - 1e-9)))
         for _ in range(count):
-            air = self.pneumatics.step(duration / count)
-            if self._wiring is not None:
-                air = self._wiring.felt(air, self.pneumatics.atmosphere)
-            self.twin.step(air, duration / count)
+            self.twin.step(self.pneumatics.step(duration / count), duration / count)
 
     def advance(self, command: Array, duration: float) -> None:
         """Hold a command (M,) [Pa] for a time [s]."""
