@@ -220,6 +220,22 @@ def test_lost_tags_lead_back_to_the_plan(planned):
     assert correction[-1] > 100.0
 
 
+def test_one_bad_picture_does_not_end_feedback(planned, monkeypatch):
+    feedback = Feedback(planned)
+    measure, bad = feedback.measure, []
+
+    def seen(time, bend_angle, tip, *more):
+        if not bad and time > 6.0:
+            bad.append(time)
+            tip = tip + 0.3
+        measure(time, bend_angle, tip, *more)
+
+    monkeypatch.setattr(feedback, "measure", seen)
+    play(planned, Chain(), feedback, Sensors())
+    assert len(bad) == 1
+    assert feedback.warnings == []
+
+
 def test_correcting_a_limb_that_does_not_follow_does_no_harm(planned):
     plant, other = Chain(), Chain()
     plant.chain.change_gain(0.1)

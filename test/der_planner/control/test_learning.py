@@ -66,6 +66,17 @@ def test_the_error_of_a_rod_with_less_gain_falls_by_more_than_five(learned):
     assert all(run.accepted for run in learner.history)
 
 
+def test_a_wild_tip_is_left_out_and_the_next_plan_stays_the_same_until_it_was_played(first):
+    limb, learner = other_limb(), Learner(first)
+    tip = play(first, limb)
+    error = mean_error(first, tip)
+    tip[len(tip) // 2] = [0.9, 0.0]
+    learner.add(first.time, tip)
+    following = learner.next()
+    assert mean_error(following, play(following, limb)) < 0.5 * error
+    assert learner.next() is following
+
+
 def test_what_is_expected_of_the_next_plan_comes_true(learned):
     _, planned, _ = learned
     tip = play(planned, other_limb())

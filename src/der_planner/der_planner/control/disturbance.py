@@ -97,6 +97,11 @@ class Measured:
         seen &= np.isfinite(variance) & (variance >= 0)
         return cls(clock[seen], place[seen], np.maximum(variance[seen], _LEAST_NOISE**2))
 
+    def only(self, rows: Mask) -> Measured:
+        """Return some of the rows (K,)."""
+        variance = None if self.variance is None else self.variance[rows]
+        return Measured(self.time[rows], self.tip[rows], variance)
+
     def check_units(self, length: float, duration: float) -> None:
         """Refuse tips and instants that no run can have: in millimetres, or milliseconds.
 

@@ -59,6 +59,8 @@ _MEMORY_TIME = 0.4
 """Time of the low-pass of δθ before friction and creep [s]."""
 _STRANGE = 6.0
 """Squared distance per coordinate from where a measurement counts less."""
+_STRANGEST = 200.0
+"""Largest squared distance per coordinate with which one picture counts in their smoothed value."""
 _EVENT = (0.0, 0.5, 1000.0, 0.05, 0.0)
 """What an event adds to the deviation of δθ, δθ̇ [rad/s], d [Pa], g and b."""
 
@@ -157,10 +159,12 @@ class Estimator:
     def _noise(self, covariance: ArrayLike | None) -> Array:
         noise = np.diag(np.repeat(np.square(_NOISE), [self.inputs, 2]))
         given = noise if covariance is None else np.asarray(covariance, dtype=float)
-        if given.shape not in ((2, 2), noise.shape) or (np.diagonal(given) < 0.0).any():
+        if given.shape not in ((2, 2), noise.shape) or not (
+            np.isfinite(given).all() and (np.diagonal(given) >= 0.0).all()
+        ):
             raise ValueError(
                 f"covariance must be that of the tip (2, 2) or of bend angles and tip "
-                f"{noise.shape}, with variances that are not negative, got {given.tolist()}"
+                f"{noise.shape}, finite, with variances that are not negative, got {given.tolist()}"
             )
         noise[-len(given) :, -len(given) :] = given
         return noise
@@ -366,5 +370,5 @@ class Estimator:
         mean = known.mean + gain @ gap
         spread = spread - gain @ expected @ gain.T
         spread = 0.5 * (spread + spread.T)
-        smooth = known.strange + 0.05 * (distance - known.strange)
+        smooth = known.strange + 0.05 * (min(distance, _STRANGEST) - known.strange)
         return replace(known, mean=mean, covariance=spread, strange=smooth, row=row)

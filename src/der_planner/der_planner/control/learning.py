@@ -39,7 +39,7 @@ from der_planner.control.disturbance import (
 from der_planner.control.repeatability import PlayedRun, Runs
 from der_planner.identification.update import adapted
 from der_planner.limb import Limb, LimbError
-from der_planner.limb.plausible import TOO_SMALL
+from der_planner.limb.plausible import TOO_SMALL, impossible
 from der_planner.methods import LEARNED
 from der_planner.planning.correction import PULL, Correction
 from der_planner.planning.loads import PlanningError
@@ -120,6 +120,7 @@ class Learner:
         self._plan = plan
         self._pending: PlayedRun | None = None
         self._beyond: Array | None = None
+        self._given = False
         self._begin()
 
     def _begin(self) -> None:
@@ -167,7 +168,9 @@ class Learner:
             LearningError: the arrays do not fit together, to the plan or to the limb's length.
         """
         measured = Measured.build(time, tip, covariance)
-        measured.check_units(self._correction.model.limb.length, float(self._plan.time[-1]))
+        limb = self._correction.model.limb
+        measured.check_units(limb.length, float(self._plan.time[-1]))
+        measured = measured.only(~impossible(limb, "tips", measured.tip))
         played, missed, astray = self._played(measured, commands)
         seen = float(played.shown.seen.mean())
         beyond = None
@@ -177,12 +180,15 @@ class Learner:
         accepted, said = (False, refusal) if refusal else self._accept(played)
         if accepted and beyond is not None:
             self._beyond = beyond
+        self._given = False
         number, mean, repeats = len(self.history) + 1, float(missed.mean()), self.repeatability
         run = LearningRun(number, mean, seen, accepted, self._step, repeats, said)
         self.history.append(run)
 
     def next(self) -> Plan:
-        """Return the plan to play next; the best one so far if nothing new was learned.
+        """Return the plan to play next; until a run is added it stays the same.
+
+        It is the best one so far if nothing new was learned.
 
         Raises:
             PlanningError: the optimiser found no plan.
@@ -190,6 +196,9 @@ class Learner:
         best = self._best
         if best is None:
             return self._plan
+        if self._given:
+            return self._plan
+        self._given = True
         known = self._runs.known(best)
         if self._fresh and not self.stopped:
             self._fresh = False

@@ -143,9 +143,9 @@ def play(
             estimate = feedback.estimate(instant)
             lacking = estimate.missing_pressure + estimate.gain_error * estimate.effective_pressure
             estimated = estimate.tip, lacking
-        rows.append(
-            (commands[k], plant.differential_pressure, plant.bend_angles, plant.tip, *estimated)
-        )
+        # A plant may change its own arrays in place.
+        state = map(np.array, (plant.differential_pressure, plant.bend_angles, plant.tip))
+        rows.append((commands[k], *state, *estimated))
         _advance(plant, commands[k], instant, sensors.frame_rate, event, told)
     columns = [np.array(column) for column in zip(*rows, strict=True)]
     commanded, differential, bend, tip, estimated_tip, missing = columns

@@ -221,6 +221,8 @@ def _from_commands(
 ) -> _Felt:
     material, still = model.material, np.zeros(model.inputs)
     before = still if initial.before is None else np.array(initial.before, dtype=float)
+    if before.shape != still.shape or not np.isfinite(before).all():
+        raise ValueError(f"the command before is finite, of shape {still.shape}, got {before}")
     if bend is not None:
         window = Drive(model, bend, len(command), steps, before, period).window(command)
 

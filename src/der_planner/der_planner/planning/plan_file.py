@@ -19,7 +19,7 @@ import yaml
 from der_planner.arrays import Array
 from der_planner.files import write_whole
 from der_planner.limb import Limb, LimbError
-from der_planner.model import CONTROL_PERIOD, Model
+from der_planner.model import CONTROL_PERIOD, NODES, Model
 from der_planner.model.commands import within_limits
 from der_planner.planning.configuration import configure
 from der_planner.planning.loads import PlanningError
@@ -130,6 +130,7 @@ def write_plan(plan: Plan, path: str | Path, about: Mapping[str, Any] | None = N
     content: dict[str, Any] = {
         "schema_version": SCHEMA_VERSION,
         **{name: getattr(plan, name) for name in (*_NAMES, *_NUMBERS)},
+        "nodes": getattr(plan.body, "nodes", NODES),
         "about": dict(about or {}),
         "limb": plan.limb.to_mapping(),
         "start": None
@@ -187,7 +188,7 @@ def _plan_of(content: Any) -> Plan:
     start = None
     if content["start"] is not None:
         start = Start(**{key: np.array(value, float) for key, value in content["start"].items()})
-    body = Model.of(limb, str(content["model"]))
+    body = Model.of(limb, str(content["model"]), int(content.get("nodes", NODES)))
     beside = within_limits(command, body.air, CONTROL_PERIOD, command[0])[1]
     if beside > _SAME * limb.pneumatics.pressure_limit:
         raise ValueError("its pressures or their changes are beyond the limb's limits")
