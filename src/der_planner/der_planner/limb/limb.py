@@ -283,11 +283,11 @@ class Limb:
             content = yaml.safe_load(path.read_text(encoding="utf-8"))
         except OSError as error:
             raise LimbError(f"cannot read limb file {path}: {error.strerror}") from error
-        except yaml.YAMLError as error:
+        except (yaml.YAMLError, UnicodeDecodeError) as error:
             raise LimbError(f"limb file {path} is not valid YAML: {error}") from error
         try:
             return cls.from_mapping(content)
-        except LimbError as error:
+        except (LimbError, TypeError, ValueError) as error:
             raise LimbError(f"limb file {path}: {error}") from error
 
     @classmethod
