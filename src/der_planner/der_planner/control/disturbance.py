@@ -87,7 +87,7 @@ class Measured:
             )
         seen = np.isfinite(place).all(axis=1)
         if covariance is None:
-            return cls(clock[seen], place[seen], None)
+            return cls(clock, place, None).only(seen)
         spread = np.asarray(covariance, dtype=float)
         if spread.shape != (len(clock), 2, 2):
             raise LearningError(
@@ -95,7 +95,7 @@ class Measured:
             )
         variance = np.trace(spread, axis1=1, axis2=2) / 2
         seen &= np.isfinite(variance) & (variance >= 0)
-        return cls(clock[seen], place[seen], np.maximum(variance[seen], _LEAST_NOISE**2))
+        return cls(clock, place, np.maximum(variance, _LEAST_NOISE**2)).only(seen)
 
     def only(self, rows: Mask) -> Measured:
         """Return some of the rows (K,)."""

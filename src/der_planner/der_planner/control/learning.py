@@ -194,9 +194,7 @@ class Learner:
             PlanningError: the optimiser found no plan.
         """
         best = self._best
-        if best is None:
-            return self._plan
-        if self._given:
+        if best is None or self._given:
             return self._plan
         self._given = True
         known = self._runs.known(best)

@@ -71,7 +71,7 @@ FARTHEST_WEIGHT = 1.5
 """Place of a known weight, over the prior's length, beyond which it is not in metres."""
 MISSED = 0.1
 """Error that a fit leaves, over the range of bend angles, from which on it misses the log."""
-_MISSED = (
+_MISSES_ITS_LOG = (
     "the limb that fits the log best misses it: was it mounted and loaded as said (--mounting, "
     "--payload), are units and columns right, and do angles and pressures have one clock?"
 )
@@ -176,9 +176,8 @@ def _fit(
     warnings += at_bounds(fitted.free, fitted.values)
     found = _calibrated(fitted, limb, air, recorded)
     span = np.ptp(prepared.bend[prepared.usable], axis=0)
-    residual = np.sqrt(np.nanmean(fitted.remaining**2, axis=0))
-    if np.any(residual > MISSED * span):
-        warnings.append(_MISSED)
+    if np.any(fitted.residual > MISSED * span):
+        warnings.append(_MISSES_ITS_LOG)
     warnings += filter(None, [nearly_buckling(found)])
     pcc_residual = np.full(limb.segment_count, np.nan)
     if limb.weighs_in_plane or any(term.group == "dynamics" for term in fitted.free.terms):
@@ -190,7 +189,7 @@ def _fit(
         correlation=correlation,
         air=air,
         geometry=fitted.lengths,
-        residual=residual,
+        residual=fitted.residual,
         largest=np.nanmax(np.abs(fitted.remaining), axis=0),
         pcc_residual=pcc_residual,
         span=span,
@@ -221,6 +220,11 @@ class _Fitted(NamedTuple):
     def free(self) -> FreeTerms:
         """The terms that were free."""
         return self.problem.free
+
+    @property
+    def residual(self) -> Array:
+        """Root mean square (M,) of what is left of the bend angles [rad]."""
+        return np.asarray(np.sqrt(np.nanmean(self.remaining**2, axis=0)))
 
 
 def _fit_bends_and_lengths(prior: Limb, prepared: Prepared, groups: Collection[str]) -> _Fitted:
@@ -384,7 +388,7 @@ def _with_arcs(
 
 def _calibrated(fitted: _Fitted, prior: Limb, air: AirFit | None, recorded: Prepared) -> Limb:
     """Return the limb that was found, with its air, what the log covered and where it is from."""
-    rows, error = recorded.usable, np.sqrt(np.nanmean(fitted.remaining**2, axis=0))
+    rows = recorded.usable
     return replace(
         fitted.limb,
         pcc_segments=(),
@@ -397,7 +401,7 @@ def _calibrated(fitted: _Fitted, prior: Limb, air: AirFit | None, recorded: Prep
             "source": recorded.log.source,
             "date": datetime.datetime.now(datetime.timezone.utc).date().isoformat(),
             "fitted_by": "der_planner.identification",
-            "residual_deg": [round(float(v), 3) for v in np.degrees(error)],
+            "residual_deg": [round(float(v), 3) for v in np.degrees(fitted.residual)],
             "prior": prior.name,
         },
     )

@@ -11,8 +11,8 @@ SUPPLY = "close the valve at the air supply"
 """What is left where no program can vent the limb."""
 PRESSED = 1.0
 """A limb counts as under pressure from this differential pressure [kPa] on."""
-UNHEARD = 0.5
-"""Readings that are older than this [s] say nothing of what the chambers hold now."""
+BOARD_SILENT = 0.5
+"""A valve board counts as silent after this time [s] without telemetry."""
 LATE = 1.6
 """A node counts as late after this time [s] without diagnostics, which it sends once a second."""
 NODES = {
@@ -84,6 +84,12 @@ def describe_limb(driver: dict[str, Any] | None) -> str:
     return "of unknown pressure" if not measured or None in measured else "without pressure"
 
 
+def board_answers(driver: dict[str, Any] | None) -> bool:
+    """Tell whether the driver's newest state has readings of what the chambers hold now."""
+    age = None if driver is None else driver["telemetry_age"]
+    return age is not None and age < BOARD_SILENT
+
+
 def alarms(snapshot: dict[str, Any]) -> list[Alarm]:
     """Return what is wrong, worst first.
 
@@ -123,8 +129,8 @@ def _of_driver(snapshot: dict[str, Any], node: dict[str, Any] | None) -> Iterato
     limb = describe_limb(driver)
     if driver["mode"] == "fault":
         faults = "; ".join(driver["faults"]) or "no reason given"
-        age, advice = driver["telemetry_age"], "remove the cause, then arm"
-        if age is not None and age < UNHEARD:
+        advice = "remove the cause, then arm"
+        if board_answers(driver):
             told = f"The driver has vented after a fault: {faults}. The limb is {limb}"
         else:
             told = f"The driver cannot reach the board: {faults}. The limb may keep its pressures"
@@ -177,17 +183,16 @@ def _of_touch(snapshot: dict[str, Any], planner: dict[str, Any] | None) -> Itera
 
 def _of_nodes(own: dict[str, dict[str, Any]]) -> Iterator[Alarm]:
     """Yield other nodes of this limb that are dead, and what has failed of experiment or record."""
-    experiment = own.get("experiment")
-    if experiment is not None and experiment["state"] == "error":
-        told = f"The experiment has stopped: {experiment['message']}"
-        yield Alarm("danger", told, None, "see to it, then start it again with the same --out")
-    recorder = own.get("recorder")
-    if recorder is not None and recorder["state"] == "error":
-        told = f"The recorder does not record: {recorder['message']}"
-        yield Alarm("danger", told, None, "see to it, then begin the recording again")
+    for name, failed, again in (
+        ("experiment", "has stopped", "start it again with the same --out"),
+        ("recorder", "does not record", "begin the recording again"),
+    ):
+        if name in own and own[name]["state"] == "error":
+            told = f"The {name} {failed}: {own[name]['message']}"
+            yield Alarm("danger", told, None, f"see to it, then {again}")
     for name, meaning in NODES.items():
         node = own.get(name)
         if name != DRIVER and node is not None and node["state"] == "dead":
             told = f"The {name} is dead: {_reason(node)}"
-            advice = "" if experiment else f"start it again: {start_of(name, node)}"
+            advice = "" if "experiment" in own else f"start it again: {start_of(name, node)}"
             yield Alarm("danger", f"{told}; {meaning}" if meaning else told, node["age"], advice)

@@ -10,6 +10,7 @@ from typing import Any
 
 from nicegui import Client, ui
 
+from der_planner.page.alarm import board_answers
 from der_planner.page.commands import FILLING, Answer
 from der_planner.page.server import STATIC, Parts
 from der_planner.page.situation import PASCAL_PER_KILOPASCAL
@@ -25,8 +26,6 @@ FILLED = 5.0
 """The page's buttons fill a chamber to this pressure [kPa], or less where the limb bears less."""
 VENTED = 1.0
 """A segment counts as vented below this differential pressure [kPa]."""
-BOARD_SILENT = 0.5
-"""A valve board counts as silent after this time [s] without telemetry."""
 MOCAP = "motion capture stands in its place: pose_tracker runs"
 CHAMBERS = "Each chamber has been filled alone"
 """Title of the step with the buttons that fill chambers."""
@@ -171,7 +170,7 @@ def _board(driver: dict[str, Any] | None) -> Step:
         seen = f"heard {age:.2f} s ago"
     return Step(
         "The valve board answers",
-        age is not None and age < BOARD_SILENT,
+        board_answers(driver),
         seen,
         "Plug it in, start pressure_driver with the port that `ls /dev/serial/by-id` shows.",
     )

@@ -270,7 +270,7 @@ def _columns(header: list[str], path: str | Path) -> dict[str, tuple[int, float]
         raise PlanningError(
             f"{path} has no column '{missing[0]}': the first line must name x, y "
             f"and, for a timed path, time, as in 'time [s], x [m], y [m]', with commas between "
-            f"columns and decimal points; it names "
+            "columns and decimal points; it names "
             f"{[text.strip() for text in header] or 'nothing'}"
         )
     return found

@@ -130,7 +130,7 @@ def write_plan(plan: Plan, path: str | Path, about: Mapping[str, Any] | None = N
     content: dict[str, Any] = {
         "schema_version": SCHEMA_VERSION,
         **{name: getattr(plan, name) for name in (*_NAMES, *_NUMBERS)},
-        "nodes": getattr(plan.body, "nodes", NODES),
+        "nodes": plan.body.nodes,
         "about": dict(about or {}),
         "limb": plan.limb.to_mapping(),
         "start": None
