@@ -17,7 +17,7 @@ from apriltag_tracker.synthetic.camera import CameraModel, SyntheticCamera
 from apriltag_tracker.synthetic.shapes import constant_curvature
 from apriltag_tracker.tag_map import TagMap
 from der_planner.identification import CalibrationLog
-from der_planner.identification.bends import NODES, predicted
+from der_planner.identification.bends import NODES, Predicted
 from der_planner.identification.log import Prepared
 from der_planner.identification.terms import FreeTerms
 from der_planner.limb import Limb
@@ -68,7 +68,7 @@ def _fit() -> None:
     log = CalibrationLog(time, pressure, pressure, 0 * pressure, 0 * pressure)
     free = FreeTerms.of(limb, {"gain"})
     prepared = Prepared(log, pressure, log.bend_angles, np.ones(4, dtype=bool), ())
-    predicted(free, RodModel(limb, NODES), prepared, free.unknowns.prior)
+    assert Predicted(free, RodModel(limb, NODES), prepared, free.unknowns.prior).by
 
 
 def _in_plane() -> None:

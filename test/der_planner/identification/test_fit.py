@@ -7,7 +7,7 @@ import pytest
 from limbs import with_segments
 
 from der_planner.identification import CalibrationLog, LogError, check, fit, predict
-from der_planner.identification.bends import NODES, follow, predicted
+from der_planner.identification.bends import NODES, Predicted, follow
 from der_planner.identification.excitation import calibration_run, steps, sweep, waves
 from der_planner.identification.lengths import fit_geometry, lengths_of, with_lengths
 from der_planner.identification.log import Prepared
@@ -86,7 +86,7 @@ def test_derivatives_agree_with_differences(log):
     names = {term.name for term in TERMS} - {"material_damping"}  # zero is its lower bound
     free = FreeTerms.of(hidden_limb(), names)
     values = free.unknowns.prior
-    exact = predicted(free, RodModel(free.limb, NODES), prepared, values).angles_by
+    exact = Predicted(free, RodModel(free.limb, NODES), prepared, values).by[0]
     for place, term in enumerate(free.terms):
         step = 1e-4 * term.scale * np.eye(len(values))[place]
         ends = [

@@ -10,7 +10,7 @@ from limbs import with_segments
 from link_chain import LinkChain
 
 from der_planner.identification import CalibrationLog, LogError, fit, predict
-from der_planner.identification.bends import NODES, predicted
+from der_planner.identification.bends import NODES, Predicted
 from der_planner.identification.excitation import sweep, waves
 from der_planner.identification.lengths import (
     GivesWayError,
@@ -109,7 +109,8 @@ def test_tips_tell_how_much_of_a_bend_is_the_weights():
     stiffness = FreeTerms.of(other.limb, {"log_stiffness"})
 
     def rows(change: float) -> tuple[np.ndarray, np.ndarray]:
-        return tips.rows(predicted(stiffness, other, log, np.array([0.0, change])))
+        residual, slopes = tips.rows(Predicted(stiffness, other, log, np.array([0.0, change])))
+        return residual, slopes()
 
     own = np.linalg.norm(rows(0.0)[0])
     assert np.linalg.norm(rows(-0.3)[0]) > 2.5 * own

@@ -8,10 +8,11 @@ go of what friction held, which would pass for creep and for a spring that softe
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from itertools import compress
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +30,7 @@ from der_planner.identification.log import Prepared
 from der_planner.identification.terms import FreeTerms
 from der_planner.limb import Limb
 from der_planner.model import CONTROL_PERIOD, Material, Model, Response, simulate
+from der_planner.model.model import Rollout
 
 NODES = 13
 """Nodes of the rod in a fit. Its statics do not depend on them, its first two natural frequencies
@@ -64,27 +66,10 @@ _NUDGE = 1e-3
 """Change of an unknown, in units of its scale, for the slope of the effective pressure."""
 _STEP = 0.1
 """Change of an unknown, in units of its scale, for the difference of two simulations."""
-_OF_THE_BODY = (
-    *("length", "bending_stiffness", "mass_per_length"),
-    *("damping", "material_damping", "swing_inertia"),
-)
+_OF_THE_SWING = {"damping", "material_damping", "swing_inertia"}
+"""Parameters of a segment that change neither how it rests nor what drives it."""
+_OF_THE_BODY = {"length", "bending_stiffness", "mass_per_length"} | _OF_THE_SWING
 """Parameters of a segment that change the body which moves, not only what drives it."""
-
-
-class Predicted(NamedTuple):
-    """What a limb does along a log of K rows, and the derivatives by P unknowns.
-
-    Attributes:
-        angles: (K, M) bend angles [rad].
-        tip: (K, 2) [m].
-        angles_by: (K, M, P).
-        tip_by: (K, 2, P).
-    """
-
-    angles: Array
-    tip: Array
-    angles_by: Array
-    tip_by: Array
 
 
 def follow(model: Model, log: Prepared, *, linearise: bool = False) -> Response:
@@ -100,11 +85,8 @@ def follow(model: Model, log: Prepared, *, linearise: bool = False) -> Response:
     )
 
 
-def predicted(free: FreeTerms, model: Model, log: Prepared, values: Array) -> Predicted:
-    """Return bend angles and tips along a log with their derivatives by P unknowns.
-
-    What drives the limb goes through the model's exact tangent; stiffness, damping and mass, which
-    change what bends, are differences of two simulations.
+class Predicted:
+    """What a limb does along a log of K rows, and the derivatives by P unknowns where asked for.
 
     Args:
         free: the unknowns.
@@ -114,30 +96,63 @@ def predicted(free: FreeTerms, model: Model, log: Prepared, values: Array) -> Pr
 
     Raises:
         RuntimeError: the model cannot follow.
+
+    Attributes:
+        angles: (K, M) bend angles [rad].
+        tip: (K, 2) [m].
     """
-    limb, scale = free.limb_with(values), free.unknowns.scale
-    units = np.diag(scale)
-    limbs = [free.limb_with(values + _NUDGE * unit) for unit in units]
-    driven = [_same_body(limb, nudged) for nudged in limbs]
-    # The tangent of the arcs takes longer than all their differences: only where it is needed.
-    response = follow(model.another(limb), log, linearise=any(driven))
-    angles, tip = response.bend_angles, response.tip
-    angles_by, tip_by = (np.empty((*part.shape, len(values))) for part in (angles, tip))
-    if response.derivative is not None:
-        change = _moments_change(limb, list(compress(limbs, driven)), log, angles)
-        gain = np.array([segment.moment_gain for segment in limb.segments])
-        change /= gain[:, None] * _NUDGE * scale[driven]
-        tip_by[:, :, driven], angles_by[:, :, driven] = response.derivative.by_effective(change)
-    for place in np.flatnonzero(np.logical_not(driven)):
-        moved = follow(model.another(free.limb_with(values + _STEP * units[place])), log)
-        tip_by[:, :, place] = (moved.tip - tip) / (_STEP * scale[place])
-        angles_by[:, :, place] = (moved.bend_angles - angles) / (_STEP * scale[place])
-    return Predicted(angles, tip, angles_by, tip_by)
 
+    def __init__(self, free: FreeTerms, model: Model, log: Prepared, values: Array) -> None:
+        self._free, self._log, self._values = free, log, values
+        self._limb = free.limb_with(values)
+        steps = _NUDGE * np.diag(free.unknowns.scale)
+        self._nudged = [free.limb_with(values + step) for step in steps]
+        self._driven = [not self._changed(nudged) & _OF_THE_BODY for nudged in self._nudged]
+        self._model = model.another(self._limb)
+        # The tangent of the arcs takes longer than all their differences: only where it is needed.
+        self._response = follow(self._model, log, linearise=any(self._driven))
+        self.angles, self.tip = self._response.bend_angles, self._response.tip
 
-def _same_body(limb: Limb, other: Limb) -> bool:
-    pairs = zip(limb.segments, other.segments, strict=True)
-    return all(getattr(a, key) == getattr(b, key) for a, b in pairs for key in _OF_THE_BODY)
+    @cached_property
+    def by(self) -> tuple[Array, Array]:
+        """The derivatives (K, M, P) of the bend angles, and (K, 2, P) of the tip.
+
+        What drives the limb goes through the model's exact tangent; stiffness, damping and mass,
+        which change what bends, are differences of two simulations.
+        """
+        parts, count, scale = (self.angles, self.tip), len(self._values), self._free.unknowns.scale
+        angles_by, tip_by = (np.empty((*part.shape, count)) for part in parts)
+        if self._response.derivative is not None:
+            driven = np.array(self._driven)
+            nudged = list(compress(self._nudged, driven))
+            change = _moments_change(self._limb, nudged, self._log, self.angles)
+            gain = np.array([segment.moment_gain for segment in self._limb.segments])
+            change /= gain[:, None] * _NUDGE * scale[driven]
+            moved = self._response.derivative.by_effective(change)
+            tip_by[:, :, driven], angles_by[:, :, driven] = moved
+        for place in np.flatnonzero(np.logical_not(self._driven)):
+            step = np.zeros(count)
+            step[place] = _STEP * scale[place]
+            try:
+                other = self._at(step)
+            except RuntimeError:  # beyond what the model can follow
+                step = -step
+                other = self._at(step)
+            tip_by[:, :, place] = (other.tip - self.tip) / step[place]
+            angles_by[:, :, place] = (other.bend_angles - self.angles) / step[place]
+        return angles_by, tip_by
+
+    def _at(self, step: Array) -> Response | Rollout:
+        limb, response = self._free.limb_with(self._values + step), self._response
+        model = self._model.another(limb)
+        if self._changed(limb) <= _OF_THE_SWING:
+            return model.run(response.begin, response.effective_pressure, CONTROL_PERIOD)
+        return follow(model, self._log)
+
+    def _changed(self, other: Limb) -> set[str]:
+        """Return the parameters of segments in which another limb differs."""
+        pairs = zip(self._limb.segments, other.segments, strict=True)
+        return {key for a, b in pairs for key in vars(a) if getattr(a, key) != getattr(b, key)}
 
 
 def _moments_change(limb: Limb, nudged: list[Limb], log: Prepared, angles: Array) -> Array:
@@ -186,7 +201,8 @@ class BendFit:
         more_rows: Callable[[Predicted], Rows] | None = None,
     ) -> None:
         self.free, self._model, self._logs, self._more_rows = free, model, logs, more_rows
-        self._last: tuple[bytes, list[Predicted]] = (b"", [])
+        # A search comes back to its best values after steps that led to nothing better.
+        self._kept = functools.lru_cache(maxsize=8)(self._predict)
         self._bends_on = [_bends_on(free.limb, log) for log in logs]
         self._shaken = [_shaken(free.limb, log) for log in logs]
         self.weigh(np.full((3, free.limb.segment_count), ANGLE_ERROR))
@@ -224,40 +240,46 @@ class BendFit:
         return values
 
     def _predicted(self, values: Array) -> list[Predicted]:
-        """Return what is predicted along the logs; the last one is kept.
+        """Return what is predicted along the logs.
 
         Raises:
             RuntimeError: the model cannot follow the logs.
         """
-        key = same_values(values, self.free.unknowns)
-        if self._last[0] != key:
-            found = [predicted(self.free, self._model, log, values) for log in self._logs]
-            self._last = (key, found)
-        return self._last[1]
+        return self._kept(same_values(values, self.free.unknowns))
+
+    def _predict(self, key: bytes) -> list[Predicted]:
+        values = np.frombuffer(key) * self.free.unknowns.scale
+        return [Predicted(self.free, self._model, log, values) for log in self._logs]
 
     def _rows(self, values: Array) -> Rows | None:
         try:
             found = self._predicted(values)
         except RuntimeError:  # also where arcs that buckle do not come to rest
             return None
-        errors, slopes, scale = [], [], np.sqrt(CORRELATION)
-        masks = zip(self._logs, found, self._bends_on, self._shaken, strict=True)
-        for log, part, on, shaken in masks:
-            rows = log.usable
-            left = _apart(part.angles[rows] - log.log.bend_angles[rows])
-            by = _apart(part.angles_by[rows])
-            usual = np.repeat(self.errors[:2, None], rows.sum(), axis=1)
-            usual[1, ~on[rows]] = self.errors[0]  # elsewhere fast errors count as slow ones do
-            usual[0, shaken[rows]] = self.errors[2]
-            usual[1, shaken[rows] & ~on[rows]] = self.errors[2]
-            for error, change, weight in zip(left, by, 1.0 / (usual * scale), strict=True):
-                errors.append((weight * error).ravel())
-                slopes.append((weight[..., None] * change).reshape(-1, len(values)))
-        if self._more_rows is not None:
-            more = self._more_rows(found[0])
-            errors.append(more[0])
-            slopes.append(more[1])
-        return np.concatenate(errors), np.concatenate(slopes)
+        logs, places = self._logs, range(len(self._logs))
+        more = None if self._more_rows is None else self._more_rows(found[0])
+        errors = [
+            self._apart_and_weighed(k, found[k].angles - logs[k].log.bend_angles) for k in places
+        ]
+
+        def slopes() -> Array:
+            by = [self._apart_and_weighed(k, found[k].by[0]) for k in places]
+            return np.concatenate(by if more is None else [*by, more[1]()])
+
+        return np.concatenate(errors if more is None else [*errors, more[0]]), slopes
+
+    def _apart_and_weighed(self, place: int, table: Array) -> Array:
+        """Return the usable rows of a log's table (K, M, …), slow and fast parts, by weight."""
+        rows = self._logs[place].usable
+        on, shaken = self._bends_on[place][rows], self._shaken[place][rows]
+        usual = np.repeat(self.errors[:2, None], rows.sum(), axis=1)
+        usual[1, ~on] = self.errors[0]  # elsewhere fast errors count as slow ones do
+        usual[0, shaken] = self.errors[2]
+        usual[1, shaken & ~on] = self.errors[2]
+        weight = 1.0 / (usual * np.sqrt(CORRELATION))
+        parts = np.stack(_apart(table[rows]))
+        weighed = weight.reshape(*weight.shape, *[1] * (table.ndim - 2)) * parts
+        return np.asarray(weighed.reshape(-1, *table.shape[2:]))
 
     def remaining(self, values: Array) -> Array:
         """Return measured less predicted bend angles (K, M) of all logs [rad], NaN where unused.
@@ -322,7 +344,7 @@ class BendFit:
         columns, errors = [], []
         for log, part in zip(self._logs, self._predicted(values), strict=True):
             speed = np.gradient(part.angles, log.log.time, axis=0)
-            slopes = part.angles_by[log.usable].reshape(-1, len(values)) * unknowns.scale
+            slopes = part.by[0][log.usable].reshape(-1, len(values)) * unknowns.scale
             columns.append(np.column_stack([-speed[log.usable].ravel(), slopes]))
             errors.append((log.log.bend_angles - part.angles)[log.usable].ravel())
         weight = 1.0 / (ANGLE_ERROR * np.sqrt(CORRELATION * self.excess(self.remaining(values))))

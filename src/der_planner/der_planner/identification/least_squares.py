@@ -8,6 +8,7 @@ and ρ the square itself or, with ``softness``, a loss that grows like a straigh
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,8 +22,10 @@ from der_planner.arrays import Array
 
 _THREADS = ThreadpoolController()
 
-Rows = tuple[Array, Array]
-"""Weighted residuals (R,) and their derivatives by the unknowns (R, P)."""
+Rows = tuple[Array, Callable[[], Array]]
+"""Weighted residuals (R,) and what gives their derivatives by the unknowns (R, P).
+
+A search asks for derivatives only where a step has led to something better."""
 
 TOLERANCE = 1e-3
 """Relative change of the sum of squares at which a search ends: its unknowns then change by less
@@ -87,7 +90,7 @@ class LeastSquares:
         self.unknowns = unknowns
         self._cheap = cheap
         self._rows, self._softness = rows, softness
-        self._last: tuple[bytes, Rows] = (b"", (np.zeros(0), np.zeros((0, 0))))
+        self._last: tuple[bytes, Rows | None] = (b"", None)
 
     def follows(self, values: Array) -> bool:
         """Return whether the model follows with values (P,)."""
@@ -114,7 +117,7 @@ class LeastSquares:
             return rows(x * unknowns.scale)[0]
 
         def jacobian(x: Array) -> Array:
-            return rows(x * unknowns.scale)[1]
+            return rows(x * unknowns.scale)[1]()
 
         tolerance *= 1e-4 if self._cheap else 1.0
         # The matrices are too small for more threads, which would wait for each other.
@@ -139,35 +142,44 @@ class LeastSquares:
         Rows that the model cannot follow are NaN, which drives the search to a shorter step.
         """
         unknowns, key = self.unknowns, same_values(values, self.unknowns)
-        if self._last[0] != key:
-            found = self._rows(values) or (np.full(1, np.nan), np.zeros((1, len(values))))
-            known, tightness = unknowns.known, unknowns.scale / unknowns.spread
-            prior = (values - unknowns.prior) / unknowns.spread
-            residual = np.concatenate([found[0], prior[known]])
-            slopes = np.concatenate([found[1] * unknowns.scale, np.diag(tightness)[known]])
-            self._last = key, (residual, slopes)
-        return self._last[1]
+        last, rows = self._last
+        if rows is None or last != key:
+            found = self._rows(values)
+            residual = np.full(1, np.nan) if found is None else found[0]
+            known = unknowns.known
+            prior = ((values - unknowns.prior) / unknowns.spread)[known]
+
+            @functools.cache
+            def slopes() -> Array:
+                data = np.zeros((1, len(values))) if found is None else found[1]() * unknowns.scale
+                return np.concatenate([data, np.diag(unknowns.scale / unknowns.spread)[known]])
+
+            rows = np.concatenate([residual, prior]), slopes
+            self._last = key, rows
+        return rows
 
     def _summed(self, values: Array) -> Rows:
         """Return P + 1 rows that stand for all, the loss included.
 
-        Their sum of squares is that of all rows under the loss, and so are gradient and matrix of
-        Gauss and Newton. The search takes singular values of its rows: of thousands that would
-        take longer than a simulation.
+        All but the last are 0. Their sum of squares is that of all rows under the loss, and so are
+        gradient and matrix of Gauss and Newton. The search takes singular values of its rows: of
+        thousands that would take longer than a simulation.
         """
         residual, slopes = self._all_rows(values)
-        if not np.isfinite(residual).all():
-            return np.full(len(values) + 1, np.nan), np.zeros((len(values) + 1, len(values)))
         growth, total = np.ones(len(residual)), float(residual @ residual)
         if self._softness is not None:
             growth = np.sqrt(1.0 + (residual / self._softness) ** 2)
             total = 2.0 * self._softness**2 * float(np.sum(growth - 1.0))
-        weighed = slopes / growth[:, None]
-        squares, ways = np.linalg.eigh(slopes.T @ weighed)
-        sizes = np.sqrt(np.maximum(squares, 1e-15 * squares[-1] + 1e-300))
-        along = ways.T @ (weighed.T @ residual) / sizes
-        left = math.sqrt(max(total - float(along @ along), 0.0))
-        return np.append(along, left), np.vstack([sizes[:, None] * ways.T, np.zeros(len(values))])
+        root = math.sqrt(total)
+
+        def summed() -> Array:
+            by = slopes()
+            weighed = by / growth[:, None]
+            last = weighed.T @ residual / max(root, 1e-150)
+            squares, ways = np.linalg.eigh(by.T @ weighed - np.outer(last, last))
+            return np.vstack([np.sqrt(np.maximum(squares, 0.0))[:, None] * ways.T, last])
+
+        return np.append(np.zeros(len(values)), root), summed
 
     def covariance(self, values: Array, factor: float = 1.0) -> Array:
         """Return the covariance (P, P) of values that were found.
@@ -179,7 +191,7 @@ class LeastSquares:
         unknowns = self.unknowns
         found = self._rows(values)
         assert found is not None
-        slopes = found[1] * unknowns.scale
+        slopes = found[1]() * unknowns.scale
         prior = np.where(unknowns.known, unknowns.scale / unknowns.spread, 0.0)
         information = slopes.T @ slopes / max(factor, 1e-6) + np.diag(prior**2)
         covariance = np.linalg.pinv(information, hermitian=True)
@@ -192,7 +204,7 @@ def same_values(values: Array, unknowns: Unknowns) -> bytes:
 
 
 def with_differences(residual: Callable[[Array], Array], values: Array, steps: Array) -> Rows:
-    """Return residuals (R,) at values (P,) and their derivatives by forward differences.
+    """Return residuals (R,) at values (P,); their derivatives are forward differences.
 
     Args:
         residual: to evaluate.
@@ -200,8 +212,12 @@ def with_differences(residual: Callable[[Array], Array], values: Array, steps: A
         steps: (P,) changes of the values, negative for one that must not grow.
     """
     here = residual(values)
-    moved = [residual(values + step) for step in np.diag(steps)]
-    return here, np.stack([there - here for there in moved], axis=1) / steps
+
+    def slopes() -> Array:
+        moved = [residual(values + step) for step in np.diag(steps)]
+        return np.stack([there - here for there in moved], axis=1) / steps
+
+    return here, slopes
 
 
 def correlation_length(remaining: Array) -> float:

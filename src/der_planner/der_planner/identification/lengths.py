@@ -186,14 +186,18 @@ class UnevenTips:
         self._spanned = np.linalg.qr(by_lengths)[0]
 
     def rows(self, found: Predicted) -> Rows:
-        """Return the weighted residual of a prediction, and its derivatives by the P unknowns."""
-        rows, unknowns = self._seen, found.tip_by.shape[2]
+        """Return the weighted residual of a prediction."""
+        rows = self._seen
         uneven = (found.tip - self._even.tip(found.angles))[rows] - self._uneven
-        evenly = self._even.tip_jacobians(found.angles[rows]) @ found.angles_by[rows]
-        slopes = (found.tip_by[rows] - evenly).reshape(-1, unknowns)
-        residual = np.concatenate([self._weight * uneven.ravel(), self._known])
-        none = np.zeros((len(self._known), unknowns))
-        return self._left(residual), self._left(np.concatenate([self._weight * slopes, none]))
+
+        def slopes() -> Array:
+            angles_by, tip_by = found.by
+            evenly = self._even.tip_jacobians(found.angles[rows]) @ angles_by[rows]
+            by = (tip_by[rows] - evenly).reshape(-1, tip_by.shape[2])
+            none = np.zeros((len(self._known), by.shape[1]))
+            return self._left(np.concatenate([self._weight * by, none]))
+
+        return self._left(np.concatenate([self._weight * uneven.ravel(), self._known])), slopes
 
     def _left(self, rows: Array) -> Array:
         left: Array = rows - self._spanned @ (self._spanned.T @ rows)

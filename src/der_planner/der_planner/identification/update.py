@@ -352,7 +352,7 @@ def adapted(limb: Limb, tip_of: Callable[[Limb], Array | None], tip: Array) -> L
         residual, slopes = with_differences(
             lambda v: weight * missed(v).ravel(), values, _NUDGE * unknowns.spread
         )
-        return residual, np.nan_to_num(slopes)
+        return residual, lambda: np.nan_to_num(slopes())
 
     def far(values: Array) -> float:
         return float(np.linalg.norm(missed(values), axis=1).mean())

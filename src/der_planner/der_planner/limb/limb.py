@@ -318,10 +318,10 @@ class Limb:
             pneumatics=from_mapping(Pneumatics, content.get("pneumatics"), "pneumatics", _RETIRED),
             connector_length=number(content.get("connector_length", 0.0), "connector_length"),
             base_length=number(content.get("base_length", 0.0), "base_length"),
-            gravity=_triple(content.get("gravity", (0.0, 0.0, 0.0))),
+            gravity=_numbers(content.get("gravity", (0.0, 0.0, 0.0)), "gravity"),
             masses=_entries(PointMass, content.get("masses") or [], "masses"),
             calibrated=CalibratedRange(
-                **{key: tuple(float(v) for v in values) for key, values in calibrated.items()}
+                **{key: _numbers(value, f"calibrated.{key}") for key, value in calibrated.items()}
             ),
             provenance=dict(content.get("provenance") or {}),
         )
@@ -337,9 +337,16 @@ class Limb:
 
     def to_yaml(self, path: str | Path) -> None:
         """Write a limb file that `from_yaml` reads back as an equal limb, whole or not at all."""
-        text = yaml.safe_dump(self.to_mapping(), sort_keys=False, allow_unicode=True)
+        text = yaml.dump(self.to_mapping(), Dumper=_Dumper, sort_keys=False, allow_unicode=True)
         head = "# A limb, in SI units. How to choose each: the site, python3 scripts/docs.py\n"
         write_whole(path, head + commented(text, sections()))
+
+
+class _Dumper(yaml.SafeDumper):
+    """Writes numbers of numpy as numbers."""
+
+
+_Dumper.add_multi_representer(np.floating, lambda dumper, n: dumper.represent_float(float(n)))
 
 
 def sections() -> dict[str, dict[str, Parameter]]:
@@ -365,8 +372,7 @@ def _entries(kind: Any, content: object, key: str) -> tuple[Any, ...]:
     return tuple(from_mapping(kind, item, f"{key}[{index}]") for index, item in enumerate(content))
 
 
-def _triple(value: object) -> tuple[float, float, float]:
-    if not isinstance(value, Sequence) or len(value) != 3:
-        raise LimbError(f"gravity must be three numbers in m/s², got {value!r}")
-    x, y, z = (number(item, "gravity") for item in value)
-    return x, y, z
+def _numbers(value: object, key: str) -> tuple[Any, ...]:
+    if not isinstance(value, Sequence) or isinstance(value, str):
+        raise LimbError(f"{key} must be a list of numbers, got {value!r}")
+    return tuple(number(item, f"{key}[{index}]") for index, item in enumerate(value))

@@ -102,7 +102,7 @@ class Response:
         effective_pressure: (K, S, M) what the model bends under in each step [Pa].
         bend_angles: (K+1, M) [rad].
         tip: (K+1, 2) [m].
-        final: state at the end.
+        begin, final: states at the beginning and at the end.
         derivative: by the commands or pressures that were given, if it was asked for.
     """
 
@@ -111,6 +111,7 @@ class Response:
     effective_pressure: Array
     bend_angles: Array
     tip: Array
+    begin: State
     final: State
     derivative: Derivative | None = None
 
@@ -173,6 +174,7 @@ def simulate(
         felt.effective,
         moved.bend_angles,
         moved.tip,
+        begin,
         moved.final,
         derivative,
     )
