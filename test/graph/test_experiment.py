@@ -150,8 +150,8 @@ def test_an_interrupted_experiment_with_loads_and_feedback_vents_and_goes_on(exp
     rest = np.nanmedian(played.tip.value[played.tip.time < 0.0], axis=0)
     assert rest[1] < -0.05
     assert np.linalg.norm(played.reference.value[0] - rest) < 0.03
-    for name in ("tip.png", "error.png", "pressures.png", "report/report.html"):
-        assert (run.out / name).stat().st_size > 5000
+    for name in ("tip.png", "error.png", "pressures.png", "report.html"):
+        assert (run.out / "report" / name).stat().st_size > 5000
     assert_vented_and_closed(run, "same_direction_der_paper_trial1")
 
 
@@ -179,7 +179,6 @@ def test_a_rig_file_takes_the_place_of_the_twin_and_a_path_of_a_file_is_learned(
     (kept,) = (run.out / "learned").glob("*_run2.yaml")
     played = load_run(run.out / second["bag"]).setpoints.value
     np.testing.assert_allclose(played, read_plan(kept).differential_pressure, atol=1e-3)
-    assert (run.out / "learning.png").stat().st_size > 5000
     assert run.processes() == {}
     assert all(process.alive for process in graph.processes), "the rig is not the experiment's"
 

@@ -52,10 +52,6 @@ from der_planner.results import (
     evaluate_run,
     format_table,
     load_run,
-    plot_error,
-    plot_learning,
-    plot_pressures,
-    plot_tip,
     summarise,
     write_report,
     write_results,
@@ -372,7 +368,7 @@ def _metadata(run: TrialRun) -> dict[str, Any]:
 
 
 def _conclude(options: Options, kept: Kept, progress: Progress) -> None:
-    """Evaluate every run from what it left, print the table, write results and figures.
+    """Evaluate every run from what it left, print the table, write results and report.
 
     Raises:
         GraphError: a bag is missing or cannot be evaluated; the others are not lost.
@@ -383,15 +379,10 @@ def _conclude(options: Options, kept: Kept, progress: Progress) -> None:
     path = write_results(found, options.out)
     print(format_table(summarise(found), compare(found)))
     _print_instruments(found, kept)
-    figures = [
-        path for plot in (plot_tip, plot_error, plot_pressures) for path in plot(runs, options.out)
-    ]
-    figures += plot_learning(found, options.out)
     progress.say(f"results: {path}")
     if options.report:
-        progress.say(f"report: {write_report(runs, found, options.out / 'report')}")
-    names = [path.name for path in figures if path.suffix == ".png"]
-    progress.say(f"figures: {options.out}/{', '.join(names)}")
+        folder = options.out / "report"
+        progress.say(f"figures and report: {write_report(runs, found, folder)}")
 
 
 def _load(folder: Path, trial: Trial, entry: dict[str, Any]) -> RunSeries:

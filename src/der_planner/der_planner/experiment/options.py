@@ -183,7 +183,7 @@ class Options:
         False, "simulated motion capture of rigid bodies in place of the twin's camera and tags"
     )
     record_images: bool = _option(False, "raw images into the bags, too")
-    report: bool = _option(True, "skip the HTML report at the end", flag="--no-report")
+    report: bool = _option(True, "skip figures and report at the end", flag="--no-report")
     dry_run: bool = _option(False, "say what would be done, start nothing")
 
     def motion(self, name: str) -> Motion:
