@@ -62,7 +62,7 @@ def test_what_no_parameter_took_is_said_and_what_is_unknown_is_not_set(tmp_path,
         line = ["declaring", "--ros-args", "--params-file", str(file)]
         monkeypatch.setattr(sys, "argv", line)
         with pytest.raises(ParameterError) as refused:
-            check_overrides(made, refuse=True)
+            check_overrides(made)
         said = str(refused.value)
         assert "'wantde' is set, but /declaring has none: did you mean 'wanted'?" in said
         assert "nothing under /lab7/declaring is for /declaring" in said

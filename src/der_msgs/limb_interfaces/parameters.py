@@ -92,26 +92,18 @@ def _declared(node: Node, name: str, default: Value, descriptor: ParameterDescri
         return node.declare_parameter(name, meant, descriptor, ignore_override=True).value
 
 
-def check_overrides(node: Node, refuse: bool = False) -> None:
-    """Warn of every parameter value that nothing took; call it when all parameters are declared.
+def check_overrides(node: Node) -> None:
+    """Refuse parameter values that nothing took; call it when all parameters are declared.
 
-    From then on a parameter that is set and not declared is refused by its name, too.
-
-    Args:
-        node: the node.
-        refuse: raise instead: for a node on which a limit that is silently left at its default
-            could break the limb.
+    A value that was meant to change something must not leave the default in force. From then on a
+    parameter that is set and not declared is refused by its name, too.
 
     Raises:
-        ParameterError: with ``refuse``, a value was taken by no parameter; names it and what it
-            may have been meant to be.
+        ParameterError: names the value, and what it may have been meant to be.
     """
     node.add_pre_set_parameters_callback(lambda given: _only_declared(node, given))
-    found = [*_unknown_names(node), *_foreign_files(node)]
-    if found and refuse:
+    if found := [*_unknown_names(node), *_foreign_files(node)]:
         raise ParameterError("; ".join(found))
-    for text in found:
-        node.get_logger().warning(text)
 
 
 def _only_declared(node: Node, given: list[Parameter]) -> list[Parameter]:

@@ -59,8 +59,7 @@ def read_settings(node: Node, settings: type[Declared]) -> Declared:
             choices=declaration.choices,
             read_only=not declaration.changeable,
         )
-    # A misspelt limit must not leave the default in force.
-    check_overrides(node, refuse=settings is Settings)
+    check_overrides(node)
     return settings(**values)
 
 

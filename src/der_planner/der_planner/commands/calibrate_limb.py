@@ -41,6 +41,7 @@ from der_planner.experiment.console import (
     add_load_options,
     check_file,
     check_folder,
+    check_limb_file,
     command_parser,
     interrupt_once,
     run_command,
@@ -113,14 +114,14 @@ def _main(given: argparse.Namespace) -> int:
             "is so with the stiffness that it finds",
             file=sys.stderr,
         )
+    held_out = [read_log(path, given.columns, given.namespace) for path in given.held_out]
     log = _obtain(prior, given)
     kept_back = []
     if given.log is not None and not given.held_out and given.weight is None:
         log, rest = log.parted(LAST_PART)
         kept_back = [dataclasses.replace(rest, source=f"the end of {rest.source}, not shown")]
     limb, report = _fit(prior, log, loads, given)
-    unseen = [read_log(path, given.columns, given.namespace) for path in given.held_out]
-    unseen = [*kept_back, *unseen]
+    unseen = [*kept_back, *held_out]
     kept = loads.unloaded(limb)
     lines = [report.text(), *(_held_out_text(limb, each, given.longest_gap) for each in unseen)]
     text = "\n".join([*lines, _weight(kept, given)])
@@ -169,6 +170,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--quick", action="store_true", help="90 s instead of 200 s of excitation")
     parser.add_argument(
         "--terms",
+        type=_terms,
         default=",".join(GROUPS),
         help=f"model terms to fit, of {', '.join(GROUPS)}; 'none' for gain and rest angle alone",
     )
@@ -213,6 +215,15 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _terms(text: str) -> list[str]:
+    """Return the model terms of --terms."""
+    found = [] if text == "none" else text.split(",")
+    for name in found:
+        if name not in GROUPS:
+            raise argparse.ArgumentTypeError(f"'{name}' is none of {', '.join(GROUPS)}")
+    return found
+
+
 def _check(given: argparse.Namespace) -> None:
     """Refuse options that do not go together, and results that cannot be written.
 
@@ -251,7 +262,9 @@ def _check(given: argparse.Namespace) -> None:
         given.folder = (given.folder or Path("calibrations") / stamp).resolve()
         given.report = given.report or given.folder / "report"
         check_folder(given.folder, "--folder")
-    check_file(given.out)
+        if (bag := given.folder / "bag").exists():
+            raise OptionError(f"--folder has a bag already: name another one, or fit to {bag}")
+    check_limb_file(given.out)
     if given.report:
         check_folder(given.report, "--report")
 
@@ -260,8 +273,7 @@ def _fit(
     prior: Limb, log: CalibrationLog, loads: Loads, given: argparse.Namespace
 ) -> tuple[Limb, FitReport]:
     """Fit; a limb that was weighed weighs the same with the lengths that were found."""
-    terms = [] if given.terms == "none" else given.terms.split(",")
-    terms += ["mass"] if given.fit_mass else []
+    terms = [*given.terms, *(["mass"] if given.fit_mass else [])]
     weight = None if given.weight is None else (given.weight, given.at)
     limb, report = fit(prior, log, terms=terms, longest_gap=given.longest_gap, weight=weight)
     if given.mass is None:

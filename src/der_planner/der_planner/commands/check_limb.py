@@ -24,7 +24,7 @@ from der_planner.experiment.console import (
     Loads,
     OptionError,
     add_load_options,
-    check_file,
+    check_limb_file,
     command_parser,
     run_command,
 )
@@ -42,9 +42,7 @@ def _main(given: argparse.Namespace) -> int:
     if given.out is not None:
         if not given.update:
             raise OptionError("--out is the updated limb file: give --update, too")
-        check_file(given.out)
-        if given.out.exists():
-            raise OptionError(f"--out {given.out} is there already: limb files are kept")
+        check_limb_file(given.out)
     loads = Loads.given(given)
     limb = Limb.from_yaml(given.limb)
     loaded = loads.loaded(limb)

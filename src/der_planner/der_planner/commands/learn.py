@@ -27,6 +27,7 @@ from der_planner.planning import Motion, Obstacles, Plan, PlanningError, plan
 from der_planner.planning.motions import NAMES
 from der_planner.planning.plan_file import read_plan, write_plan
 from der_planner.results import BagError, EvaluationError, RunSeries, load_run
+from der_planner.results.evaluation import DRAWN
 
 FAILURES = (BagError, EvaluationError, LearningError, LimbError, PlanningError)
 """What a bag, a limb file or a plan may be lacking."""
@@ -112,10 +113,13 @@ def learning_summary(learner: Learner) -> dict[str, Any]:
 
 
 def add_plan_options(parser: argparse.ArgumentParser, needed: bool = True) -> None:
-    """Add --limb or --plan, of which one may be needed, and --obstacles."""
+    """Add --limb or --plan, of which one may be needed, --path and --obstacles."""
     base = parser.add_mutually_exclusive_group(required=needed)
     base.add_argument("--limb", type=Path, metavar="FILE", help="limb file of the plan in the bag")
     base.add_argument("--plan", type=Path, metavar="FILE", help="learned plan that was played")
+    parser.add_argument(
+        "--path", type=Path, metavar="FILE.csv", help="path that was drawn in the bag, if any"
+    )
     parser.add_argument(
         "--obstacles", type=Path, metavar="FILE", help="obstacles of the plan in the bag, if any"
     )
@@ -134,12 +138,15 @@ def plan_of(run: RunSeries, given: argparse.Namespace) -> Plan:
     if any(told.gravity):
         limb = dataclasses.replace(limb, gravity=told.gravity)
     limb = limb.carrying(told.payload, told.payload_at or None)
-    if told.motion not in NAMES:
+    if given.path:
+        motion = Motion.from_csv(given.path, nearest=DRAWN in told.extra)
+    elif told.motion in NAMES:
+        motion = Motion.named(told.motion, told.amplitude, told.period, told.cycles)
+    else:
         raise PlanningError(
-            f"{told.title} holds the drawn path '{told.motion}': give the plan that was played by "
-            "--plan FILE (run_experiment.py --learn keeps plans in its folder learned)"
+            f"{told.title} holds the drawn path '{told.motion}': give its file by --path FILE.csv, "
+            "or the plan that was played by --plan FILE"
         )
-    motion = Motion.named(told.motion, told.amplitude, told.period, told.cycles)
     in_the_way = Obstacles.from_yaml(given.obstacles) if given.obstacles else None
     try:
         return plan(limb, motion, model=told.model, obstacles=in_the_way)

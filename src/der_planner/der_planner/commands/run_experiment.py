@@ -330,6 +330,8 @@ def _describe(
         progress.say(f"  {trial.name}  seed {trial.seed}  {state}")
     each = f"of {options.period * options.cycles:.0f} s motion each"
     where = each if options.path is None else f"along {options.path}"
+    if options.path is not None and options.calibrate:
+        where += ", whose reach is looked at once the limb is calibrated"
     progress.say(f"{len(left)} trials {where}; nothing was started")
 
 

@@ -138,6 +138,17 @@ def check_file(path: Path, option: str = "--out") -> None:
     _try_folder(Path(os.path.realpath(path)).parent, f"{option} {path}")
 
 
+def check_limb_file(path: Path) -> None:
+    """Refuse a path at which no new limb file can be written.
+
+    Raises:
+        OptionError: as `check_file`, or there is a file: a calibration is not lost unseen.
+    """
+    check_file(path)
+    if path.exists():
+        raise OptionError(f"--out {path} is there already: limb files are kept, name another one")
+
+
 def check_folder(path: Path, option: str = "--out") -> None:
     """Refuse a path at which no folder can be made or written; nothing is left behind.
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import itertools
 import re
 import time
 from collections.abc import Sequence
@@ -311,7 +312,8 @@ def parse(arguments: Sequence[str]) -> Options:
         within = each.metadata.get("within")
         if within and value is not None and not within[0] <= value <= within[1]:
             name, (least, most) = each.name.replace("_", "-"), within
-            raise OptionError(f"--{name} is {value}: choose {least} to {most}")
+            text = each.metadata["help"]
+            raise OptionError(f"--{name} is {value}: choose {least} to {most} ({text})")
     loads = Loads.given(given)
     motions = _motions(given)
     models = tuple(dict.fromkeys(given.models))
@@ -323,6 +325,10 @@ def parse(arguments: Sequence[str]) -> Options:
         (
             given.page is not None and given.offline,
             "--page shows a running graph: it does not go with --offline",
+        ),
+        (
+            given.record_images and given.offline,
+            "--record-images is about bags: it does not go with --offline, which films nothing",
         ),
         (
             hardware is not None and given.offline,
@@ -386,7 +392,8 @@ def _motions(given: argparse.Namespace) -> tuple[str, ...]:
         OptionError: the path cannot be read, or motions are asked for beside it.
     """
     if given.path is None:
-        return JOINT_MOTIONS if given.motions == ["all"] else tuple(dict.fromkeys(given.motions))
+        named = [JOINT_MOTIONS if each == "all" else (each,) for each in given.motions]
+        return tuple(dict.fromkeys(itertools.chain(*named)))
     if isinstance(given.motions, list):  # the default is a tuple
         raise OptionError("--path is drawn in place of --motions: give one of the two")
     try:

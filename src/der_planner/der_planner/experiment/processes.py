@@ -102,15 +102,23 @@ class Hardware:
         except (OSError, yaml.YAMLError) as error:
             raise OptionError(f"cannot read hardware file {path}: {error}") from error
         known = [item.name for item in dataclasses.fields(cls) if item.name != "hosts"]
-        for key in content if isinstance(content, dict) else ["not a mapping"]:
+        if not isinstance(content, dict):
+            raise OptionError(f"hardware file {path}: a mapping is expected; keys: {known}")
+        for key, value in content.items():
             if key not in known:
                 raise OptionError(f"hardware file {path}: unknown key '{key}'; known: {known}")
+            kind = {"found": list, "limb": str}.get(key, dict)
+            if value is not None and not isinstance(value, kind):
+                what = "parameters by name" if kind is dict else f"a {kind.__name__}"
+                raise OptionError(f"hardware file {path}: {key} must be {what}, got {value!r}")
         hardware = cls(**{key: value for key, value in content.items() if value is not None})
         hardware.hosts.update(_hosts(hardware, path))
         named = {**hardware.tracker, **(hardware.poses or {}), **hardware.planner}
         for key, file in named.items():
             if key.endswith(("_map", "_file")) and file and not Path(file).exists():
-                raise OptionError(f"hardware file {path}: no file '{file}' ({key})")
+                raise OptionError(
+                    f"hardware file {path}: no file '{file}' ({key}), from the folder {Path.cwd()}"
+                )
         port = str(hardware.driver.get("port", ""))
         elsewhere = "pressure_driver" in hardware.hosts or port.startswith("tcp://")
         if hardware.twin is None and not elsewhere and not (port and Path(port).exists()):

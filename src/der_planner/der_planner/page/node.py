@@ -87,7 +87,7 @@ class PageNode(Node):
         )
         self._leased = False
         # A misspelt name of a protection must not leave the page without it.
-        check_overrides(self, refuse=True)
+        check_overrides(self)
         self._situation = Situation(namespace=self.get_namespace())
         self._parts = Parts(
             situation=self._situation,
