@@ -53,6 +53,8 @@ _HARDEST = 1.0
 """Largest pull, over the tip's movement per pressure."""
 _WORSE = 1.02
 """Share of the best plan's error that a plan may leave, beyond repeatability, and not be worse."""
+_SHOWN_WORSE = 1.1
+"""Share of the best plan's run that another run may miss by, before the best one is repeated."""
 _SMALLEST_STEP = 0.1
 """α below which learning stops."""
 _TRIES = 2
@@ -348,27 +350,40 @@ class Learner:
             return _FIRST
         new, old = self._runs.level(run), self._runs.level(before)
         said = f"leaves {new * 100:.3f} cm after {old * 100:.3f} cm"
-        same = np.array_equal(run.commands, before.commands)
         known = self._runs.known(run)
         margin = self.repeatability / np.sqrt(max(known.runs, 1.0))
-        if same:
+        self._best = min((run, before), key=self._runs.level)
+        if np.array_equal(run.commands, before.commands):
             said += ", the same plan again"
         elif new > _WORSE * old + min(margin, old):
             self._smaller_step()
             said += f": worse than the best plan, back to it with a step of {self._step:.2f}"
+        elif self._passes_for_noise(run, before):
+            self._smaller_step()
+            self._best, self._fresh = before, False
+            said += ", but showed more: the best plan is played again, to see how well it repeats"
         else:
             self._step = min(1.0, 2 * self._step)
-        self._best = min((run, before), key=self._runs.level)
         self._levels.append(self._runs.level(self._best))
         if not self.stopped:
             self.stopped = self._reason_to_stop()
         return f"{said}; stopped: {self.stopped}" if self.stopped else said
 
+    def _passes_for_noise(self, run: PlayedRun, before: PlayedRun) -> bool:
+        """Tell whether a run that showed more than the best one is called noise, untried.
+
+        Noise is what runs of one plan differ by. Where none was repeated, a limb whose friction
+        answers small changes otherwise than its model looks noisy, too, and gets worse run by run.
+        """
+        showed, best = self._runs.shown(run), self._runs.shown(before)
+        return not self._runs.repeated and showed > _SHOWN_WORSE * best
+
     def _reason_to_stop(self) -> str:
         if self._best is None:
             return ""
         known, left = self._runs.known(self._best), self._levels[-1]
-        if known.runs >= _ENOUGH_RUNS and left < 0.5 * self.repeatability:
+        noisy = self._runs.repeated and left < 0.5 * self.repeatability
+        if noisy and known.runs >= _ENOUGH_RUNS:
             return (
                 f"only noise is left: runs of one plan differ by {self.repeatability * 100:.3f} cm"
             )

@@ -132,10 +132,11 @@ class Runs:
     def __init__(self, reference: Array, period: float, tip_per_pressure: float) -> None:
         self._reference, self._period, self._tip_per_pressure = reference, period, tip_per_pressure
         self._all: list[PlayedRun] = []
-        self.repeats = Repeatability()
+        self.repeats, self.repeated = Repeatability(), False
 
     def add(self, run: PlayedRun) -> None:
-        """Take in a run."""
+        """Take in a run; `repeated` tells whether two were of one plan, which alone show N."""
+        self.repeated |= self.expected(run.commands) is not None
         self._all.append(run)
         self.repeats = estimate(self._pairs())
 
@@ -169,6 +170,11 @@ class Runs:
     def level(self, run: PlayedRun) -> float:
         """Return the mean distance from r̄ that all runs say the commands of one leave [m]."""
         return float(np.linalg.norm(self.error(run), axis=1).mean())
+
+    def shown(self, run: PlayedRun) -> float:
+        """Return the mean distance from r̄ that a run itself showed [m]."""
+        left = (run.expected.tip + run.shown.value - self._reference)[run.shown.seen]
+        return float(np.linalg.norm(left, axis=1).mean())
 
     def unlike(self, run: PlayedRun) -> str:
         """Return how a run differs from all others; empty if it is one of them."""
