@@ -20,7 +20,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from der_planner.files import write_whole
+from der_planner.files import read_yaml, write_whole
 from der_planner.limb.declaration import (
     LimbError,
     Parameter,
@@ -278,13 +278,7 @@ class Limb:
             LimbError: the file is missing, is not YAML, or a key is missing, unknown, of the wrong
                 type or out of range; the message names the file and the key.
         """
-        path = Path(path)
-        try:
-            content = yaml.safe_load(path.read_text(encoding="utf-8"))
-        except OSError as error:
-            raise LimbError(f"cannot read limb file {path}: {error.strerror}") from error
-        except (yaml.YAMLError, UnicodeDecodeError) as error:
-            raise LimbError(f"limb file {path} is not valid YAML: {error}") from error
+        content = read_yaml(path, "limb file", LimbError)
         try:
             return cls.from_mapping(content)
         except (LimbError, TypeError, ValueError) as error:
