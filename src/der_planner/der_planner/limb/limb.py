@@ -36,6 +36,7 @@ from der_planner.limb.declaration import (
 from der_planner.limb.loads import (
     BEYOND_THE_TIP,
     PAYLOAD,
+    Load,
     PointMass,
     gravity_of,
     mounting_of,
@@ -234,6 +235,15 @@ class Limb:
         self._check_place(f"the {name}'s arc_length", place)
         mass = PointMass(place, float(payload), name)
         return dataclasses.replace(self, masses=(*self.masses, mass))
+
+    def loaded(self, load: Load) -> Limb:
+        """Return the limb under a load, as `mounted` and `carrying` say.
+
+        Raises:
+            LimbError: the mounting is unknown, or the payload is too heavy or not on the limb.
+        """
+        mounted = self.mounted(load.mounting) if load.mounting else self
+        return mounted.carrying(load.payload, load.payload_at or None)
 
     @property
     def payload(self) -> tuple[float, float]:

@@ -23,7 +23,7 @@ from der_msgs.msg import LimbState, MotionCommand
 from der_planner.arrays import Array
 from der_planner.control.feedback import Feedback
 from der_planner.control.reaction import KINDS, Kind
-from der_planner.limb import HEAVIEST, Limb
+from der_planner.limb import HEAVIEST, Limb, Load
 from der_planner.methods import LEARNED
 from der_planner.planning import METHODS, Motion, Obstacles, PathLimits, choose_method
 from der_planner.planning.motions import DEFAULT_AMPLITUDE, DEFAULT_CYCLES, DEFAULT_PERIOD
@@ -101,7 +101,7 @@ def read_parameters(node: Node) -> PlannerOptions:
         "of them in place of its motion"
     )  # fmt: skip
     options = PlannerOptions(
-        limb=limb.mounted(mounting) if mounting else limb,
+        limb=limb.loaded(Load(mounting=mounting)),
         limb_file=str(Path(limb_file).absolute()) if limb_file else "",
         payload=read(
             "payload", 0.0, "mass [kg] carried beside the limb's own masses, where a command names "
@@ -283,9 +283,8 @@ def _request(
     in place of it.
     """
     start = start_of(nanoseconds(message.header.stamp), now)
-    limb = options.limb.mounted(message.mounting) if message.mounting else options.limb
-    load = message if message.payload else options
-    limb = limb.carrying(load.payload, load.payload_at or None)
+    carried = message if message.payload else options
+    limb = options.limb.loaded(Load(carried.payload, carried.payload_at, message.mounting))
     model, learned = message.model or options.model, None
     if motion is None:
         learned = learned_plan(options.learned_plans, message.motion, limb)

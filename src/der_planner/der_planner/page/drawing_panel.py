@@ -15,7 +15,7 @@ from nicegui.events import GenericEventArguments
 
 from der_msgs.msg import MotionCommand
 from der_planner.arrays import Array
-from der_planner.page.commands import Load
+from der_planner.limb import Load
 from der_planner.page.drawing import DrawingError, Preview, drawn_pixels
 from der_planner.page.server import Parts
 from der_planner.page.situation import centimetres

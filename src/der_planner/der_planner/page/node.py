@@ -36,9 +36,9 @@ from der_msgs.msg import (
     PressureState,
     TagDetectionArray,
 )
-from der_planner.limb import Limb, LimbError
+from der_planner.limb import Limb, LimbError, Load
 from der_planner.page.access import Binding, Desk
-from der_planner.page.commands import Commands, Load
+from der_planner.page.commands import Commands
 from der_planner.page.drawing import DrawingFolder, Previewer
 from der_planner.page.picture import Overlay, PictureFeed
 from der_planner.page.server import PageServer, Parts
@@ -139,7 +139,7 @@ class PageNode(Node):
     def _read_limb(self, file: str) -> Limb:
         self._limb_file = file
         limb = Limb.from_yaml(file) if file else Limb.default()
-        return limb.mounted(self._mounting) if self._mounting else limb
+        return limb.loaded(Load(mounting=self._mounting))
 
     # What comes in -------------------------------------------------------------------------
 

@@ -26,7 +26,7 @@ from der_planner.arrays import Array
 from der_planner.control import Feedback, Learner, lockstep
 from der_planner.identification import FitReport, calibrate_twin, predict, record_twin
 from der_planner.identification.excitation import TIP_NOISE, Excitation
-from der_planner.limb import Limb, Pneumatics, declarations
+from der_planner.limb import Limb, Load, Pneumatics, declarations
 from der_planner.model import simulate
 from der_planner.planning import Motion, Plan, plan
 from der_planner.studies.factors import (
@@ -188,8 +188,7 @@ def _errors(planned: Plan, tip: Array) -> Result:
 
 def _loaded(limb: Limb, row: Mapping[str, Any]) -> Limb:
     """Return a limb as a row mounts it, with the row's payload."""
-    at = row["payload_at"]
-    return limb.mounted(row["mounting"]).carrying(row["payload"], at if at > 0 else None)
+    return limb.loaded(Load(row["payload"], row["payload_at"], row["mounting"]))
 
 
 def _planned(limb: Limb, row: Mapping[str, Any]) -> Plan:
