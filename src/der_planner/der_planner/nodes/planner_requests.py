@@ -20,7 +20,7 @@ from rclpy.node import Node
 
 from der_msgs.action import PlayMotion
 from der_msgs.msg import LimbState, MotionCommand
-from der_planner.arrays import Array
+from der_planner.arrays import Array, points_of
 from der_planner.control.feedback import Feedback
 from der_planner.control.reaction import KINDS, Kind
 from der_planner.limb import HEAVIEST, Limb, Load
@@ -239,7 +239,7 @@ def from_command(message: MotionCommand, options: PlannerOptions, now: int) -> R
             raise ValueError(
                 "the command has a path, and a motion or a learned plan beside it: give one of them"
             )
-        tip = np.array([(point.x, point.y) for point in message.path])
+        tip = points_of(message.path)
         motion = _along_path(None, tip, options, message.nearest_path or options.nearest_path)
     elif message.method != LEARNED:
         motion = Motion.named(
@@ -261,10 +261,10 @@ def from_path(message: PathMessage, plan_id: str, options: PlannerOptions, now: 
     frame = message.header.frame_id
     if frame not in ("", topics.BASE_FRAME):
         raise ValueError(f"the path is in frame '{frame}': send it in '{topics.BASE_FRAME}'")
-    tip = np.array([(p.pose.position.x, p.pose.position.y) for p in message.poses])
+    tip = points_of(each.pose.position for each in message.poses)
     stamps = [nanoseconds(pose.header.stamp) for pose in message.poses]
     time = (np.array(stamps) - stamps[0]) * 1e-9 if any(stamps) else None
-    motion = _along_path(time, tip.reshape(-1, 2), options, options.nearest_path)
+    motion = _along_path(time, tip, options, options.nearest_path)
     return _request(MotionCommand(header=message.header, plan_id=plan_id), motion, options, now)
 
 

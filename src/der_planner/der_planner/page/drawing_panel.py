@@ -67,7 +67,7 @@ class DrawingPanel:
         return self._playable is not None and bool(self._switch.value)
 
     def _run(self, function: str, *arguments: object) -> None:
-        """Call a function of draw.js in the window."""
+        """Call a function of drawing.js in the window."""
         given = ", ".join(json.dumps(each, separators=(",", ":")) for each in arguments)
         self._client.run_javascript(f"page.drawing.{function}({given})")
 
