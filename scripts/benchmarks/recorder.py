@@ -143,9 +143,9 @@ def evaluate_long_bag(minutes: float) -> dict[str, float]:
 
 EVALUATE = """
 import resource, sys, time
-from der_planner.results import evaluate_bag
+from der_planner.results import evaluate_run, load_run
 begin = time.perf_counter()
-result = evaluate_bag(sys.argv[1])
+result = evaluate_run(load_run(sys.argv[1]))
 assert abs(result.mean_error_m - 0.005) < 1e-4, result
 print(time.perf_counter() - begin, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3)
 """

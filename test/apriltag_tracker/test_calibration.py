@@ -137,11 +137,14 @@ def test_mounting_is_measured_on_the_straight_limb(config, tags, model):
     for tag in wrong:
         assert result.offsets[tag.id] == pytest.approx(tag.offset, abs=1e-3)
         assert result.offsets[tag.id][:2] == pytest.approx(tag.offset[:2], abs=3e-5)
-    text = calibration.with_offsets((config / "tags.yaml").read_text(), tags.limb, result)
+    text = calibration.with_offsets((config / "tags.yaml").read_text(), result)
     again = TagMap.from_dict(yaml.safe_load(text))
-    assert "# Where every AprilTag" in text
+    assert text.startswith("# Where every AprilTag")
     for read, tag in zip(again.limb, wrong, strict=True):
         assert read.offset == pytest.approx(tag.offset, abs=1e-3)
+    assert dataclasses.replace(again, limb=tags.limb) == tags
+    dumped = yaml.safe_dump(yaml.safe_load(text))  # one key a line, as programs write them
+    assert TagMap.from_dict(yaml.safe_load(calibration.with_offsets(dumped, result))) == again
 
 
 def test_mounting_without_fixed_tags_names_the_cause(tags, model):

@@ -18,7 +18,7 @@ from der_planner.experiment.console import Progress
 from der_planner.experiment.graph_run import RunningGraph
 from der_planner.experiment.processes import GraphError, find_executable
 from der_planner.limb import DEFAULT_LIMB_FILE
-from der_planner.results import evaluate_bag
+from der_planner.results import evaluate_run, load_run
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 SEED = 3
@@ -168,7 +168,7 @@ def test_a_clock_that_is_off_on_the_other_computer_forbids_feedback_and_nothing_
     assert float(said[1]) == pytest.approx(30.0, abs=10.0)
     assert "not armed: feedback needs clocks that agree within 10 ms" in run.stderr
     assert "chrony" in run.stderr
-    played = evaluate_bag(tmp_path / "out" / "bags" / "same_direction_der_paper_trial1")
+    played = evaluate_run(load_run(tmp_path / "out/bags/same_direction_der_paper_trial1"))
     assert played.valid_fraction > 0.9
     offset, uncertainty = re.search(
         r"/limb/apriltag_tracker \+(\S+) ± (\S+) ms", played.extra["clocks"]

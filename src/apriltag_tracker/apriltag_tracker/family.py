@@ -34,7 +34,6 @@ class Family:
         name: as the AprilTag library calls it.
         code_cells: cells along the edge of the code inside of the border.
         tag_count: how many tags there are.
-        hamming: cells in which any two codes differ at least, however they are turned.
         first_code: bits of the printed tag 0, row by row from its upper left, as published.
         correct_bits: wrong cells of a code that are forgiven in a search, if nothing else is said.
         most_corrected: the same at most: with more, pictures without a tag show some.
@@ -46,7 +45,6 @@ class Family:
     name: str
     code_cells: int
     tag_count: int
-    hamming: int
     first_code: int
     correct_bits: int
     most_corrected: int
@@ -161,12 +159,12 @@ def _codes(family: Family) -> NDArray[np.uint8]:
 _STRONG, _CLEAR = 0.6, 0.35
 
 _ALL = (
-    Family("tag36h11", 6, 587, 11, 0xD5D628584, 1, 2, _STRONG, cv2.aruco.DICT_APRILTAG_36h11),
-    Family("tag36h10", 6, 2320, 10, 0x1CA92A687, 1, 1, _STRONG, cv2.aruco.DICT_APRILTAG_36h10),
-    Family("tag25h9", 5, 35, 9, 0x155CBF1, 0, 1, _CLEAR, cv2.aruco.DICT_APRILTAG_25h9),
-    Family("tag16h5", 4, 30, 5, 0x231B, 0, 0, _CLEAR, cv2.aruco.DICT_APRILTAG_16h5),
-    Family("tagStandard41h12", 3, 2115, 12, 0x1BC2788B1A4, 2, 2, _STRONG, None),
-    Family("tagStandard52h13", 4, 48714, 13, 0x406B98AB8AA9A, 3, 4, _STRONG, None),
+    Family("tag36h11", 6, 587, 0xD5D628584, 1, 2, _STRONG, cv2.aruco.DICT_APRILTAG_36h11),
+    Family("tag36h10", 6, 2320, 0x1CA92A687, 1, 1, _STRONG, cv2.aruco.DICT_APRILTAG_36h10),
+    Family("tag25h9", 5, 35, 0x155CBF1, 0, 1, _CLEAR, cv2.aruco.DICT_APRILTAG_25h9),
+    Family("tag16h5", 4, 30, 0x231B, 0, 0, _CLEAR, cv2.aruco.DICT_APRILTAG_16h5),
+    Family("tagStandard41h12", 3, 2115, 0x1BC2788B1A4, 2, 2, _STRONG, None),
+    Family("tagStandard52h13", 4, 48714, 0x406B98AB8AA9A, 3, 4, _STRONG, None),
 )
 
 FAMILIES = {family.name: family for family in _ALL}

@@ -1,7 +1,7 @@
 """Sheets to print: tags of the limb, fixed tags and the calibration board, in true size.
 
-A page is a list of black rectangles and labels in millimetres, written as SVG or PDF: both are
-vectors, so that the edges of the tags are as straight as the printer is.
+A page is a list of black rectangles and labels in millimetres, written as PDF: its vectors keep
+the edges of the tags as straight as the printer is.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from matplotlib import rc_context
 from matplotlib.backends.backend_pdf import PdfPages
 from matplotlib.figure import Figure
 from matplotlib.patches import PathPatch
@@ -224,12 +223,6 @@ def _outline(boxes: Sequence[tuple[float, float, float, float]]) -> MatplotlibPa
         MatplotlibPath.MOVETO, *[MatplotlibPath.LINETO] * 3, MatplotlibPath.CLOSEPOLY
     ] * len(boxes)  # fmt: skip
     return MatplotlibPath(np.reshape(corners, (-1, 2)), codes)
-
-
-def write_svg(page: Page, path: Path) -> None:
-    """Write one page as SVG."""
-    with rc_context({"svg.fonttype": "none"}):
-        drawing(page).savefig(path, format="svg")
 
 
 def write_pdf(pages: Sequence[Page], path: Path) -> None:

@@ -1,7 +1,8 @@
-"""The one type of array in signatures, its shape in the docstring, and lines between samples."""
+"""The one type of array in signatures, its shape in the docstring; lines, distances and points."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -25,3 +26,8 @@ def interpolate(instants: Numbers, time: Numbers, values: Array) -> Array:
 def rms_distance(difference: Array) -> float:
     """Return the root mean square of the lengths of K vectors (K, N)."""
     return float(np.sqrt(np.mean(np.sum(difference**2, axis=1))))
+
+
+def points_of(points: Iterable[Any]) -> Array:
+    """Return the points of a message as (P, 2) [m]."""
+    return np.array([(point.x, point.y) for point in points]).reshape(-1, 2)

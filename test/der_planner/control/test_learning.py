@@ -191,8 +191,7 @@ def test_a_worse_plan_is_left_for_the_best_with_a_smaller_step(first, learned_tw
     worse = 0.97 * best
     tip = simulate(other_limb(), planned.time, commands=worse).tip[:-1]
     learner.add(planned.time, tip, commands=worse)
-    assert learner.history[-1].step == 0.5
-    assert "back to it" in learner.history[-1].reason
+    assert "back to it with a step of 0.50" in learner.history[-1].reason
     assert mean_error(first, play(learner.next(), other_limb())) <= errors[1]
 
 

@@ -135,18 +135,18 @@ def test_a_motion_into_an_obstacle_is_refused_before_anything_is_started(tmp_pat
             options.check_motions(Limb.default(), options.plan_of_trials())
 
 
-def test_loads_are_those_of_the_command_line():
+def test_the_load_is_that_of_the_command_line():
     options = parse(["--mounting", "hanging", "--payload", "0.02", "--payload-at", "0.2"])
     default = Limb.default()
-    assert options.loads.mounted(default) == default.mounted("hanging")
-    assert options.loads.loaded(default).masses == (PointMass(0.2, 0.02, "payload"),)
+    assert default.loaded(options.load) == default.mounted("hanging").carrying(0.02, 0.2)
+    assert default.loaded(options.load).masses == (PointMass(0.2, 0.02, "payload"),)
     # A calibrated limb is a little shorter or longer than the place that was measured.
-    at_tip = parse(["--payload", "0.02", "--payload-at", "0.2465"]).loads.loaded(default)
+    at_tip = default.loaded(parse(["--payload", "0.02", "--payload-at", "0.2465"]).load)
     assert at_tip.masses[0].arc_length == default.length
     assert at_tip.payload == (0.02, 0.0)
-    assert options.loads.loaded(default).payload == (0.02, 0.2)
+    assert default.loaded(options.load).payload == (0.02, 0.2)
     hung = default.mounted("30")
-    assert parse([]).loads.loaded(hung) == hung
+    assert hung.loaded(parse([]).load) == hung
 
 
 def test_a_path_is_refused_with_its_line_and_the_remedy(tmp_path: Path):

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from der_planner.limb import GRAVITY, CalibratedRange, Limb, LimbError, PointMass, gravity_of
+from der_planner.limb import GRAVITY, CalibratedRange, Limb, LimbError, Load, PointMass, gravity_of
 
 LIMB = Limb.default()
 
@@ -50,6 +50,14 @@ def test_a_payload_of_nothing_changes_nothing_and_one_off_the_limb_is_refused():
     assert base.carrying(0.01).masses[0].arc_length == pytest.approx(0.264)
     assert LIMB.carrying(0.01, 0.1).carrying(0.02).payload == (0.02, 0.0)
     assert base.carrying(0.01).for_model("pcc").masses == base.carrying(0.01).masses
+
+
+def test_a_load_mounts_the_limb_and_hangs_its_payload_on():
+    assert LIMB.loaded(Load()) is LIMB
+    assert LIMB.loaded(Load(0.02)).payload == (0.02, 0.0)
+    assert LIMB.loaded(Load(0.02, 0.1, "hanging")) == LIMB.mounted("hanging").carrying(0.02, 0.1)
+    with pytest.raises(LimbError, match="mounting 'upside' is unknown"):
+        LIMB.loaded(Load(mounting="upside"))
 
 
 def test_a_limb_weighs_what_the_scale_says_with_its_fittings():

@@ -10,9 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
-from der_planner.limb import Limb, LimbError
+from der_planner.limb import Limb, LimbError, Load
 from der_planner.model import ArcModel
-from der_planner.page.commands import Load
 from der_planner.page.drawing import (
     DrawingError,
     DrawingFolder,

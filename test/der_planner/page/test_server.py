@@ -16,9 +16,9 @@ import pytest
 from fastapi.testclient import TestClient
 
 from apriltag_tracker.tag_map import LimbTag, TagMap
-from der_planner.limb import Limb
+from der_planner.limb import Limb, Load
 from der_planner.page.access import Desk
-from der_planner.page.commands import Commands, Load
+from der_planner.page.commands import Commands
 from der_planner.page.drawing import DrawingFolder, Previewer
 from der_planner.page.picture import Overlay, PictureFeed
 from der_planner.page.server import Parts, create_app

@@ -13,7 +13,6 @@ from der_planner.identification import read_bag
 from der_planner.results import (
     BagError,
     EvaluationError,
-    evaluate_bag,
     evaluate_bags,
     evaluate_run,
     format_table,
@@ -54,7 +53,7 @@ def folder(tmp_path_factory) -> Path:
 
 
 def test_run_of_a_bag(folder: Path):
-    result = evaluate_bag(folder)
+    result = evaluate_run(load_run(folder))
     assert result.mean_error_m == pytest.approx(0.005, abs=3e-5)
     assert (result.motion, result.model, result.method) == ("same_direction", "der", "paper")
     assert (result.trial, result.seed, result.limb) == (2, 7, "test limb")
@@ -73,14 +72,14 @@ def test_a_board_with_crossed_hoses_receives_every_setpoint(tmp_path: Path):
     bag = BagOfRun(tmp_path / "run", run=json.dumps({"wiring": [2, 0, 3, 1]}))
     write_run(bag, valves=(2, 0, 3, 1))
     bag.bag.close()
-    assert evaluate_bag(tmp_path / "run").checks["board_lost"] == 0
+    assert evaluate_run(load_run(tmp_path / "run")).checks["board_lost"] == 0
 
 
 def test_times_come_from_the_setpoints_not_from_arrival_or_plan(tmp_path: Path):
     bag = BagOfRun(tmp_path / "run")
     write_run(bag, first_setpoint=-3.0)  # the plan's own stamp is off by 3 s
     bag.bag.close()
-    assert evaluate_bag(tmp_path / "run").mean_error_m == pytest.approx(0.005, abs=3e-5)
+    assert evaluate_run(load_run(tmp_path / "run")).mean_error_m == pytest.approx(0.005, abs=3e-5)
 
 
 @pytest.mark.parametrize("storage", [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
@@ -95,7 +94,7 @@ def test_bag_in_rosbags_own_layout_evaluates_the_same(folder: Path, tmp_path: Pa
         }
         for connection, when, data in source.messages(source.connections):
             target.write(made[connection.id], when, data)
-    one, two = asdict(evaluate_bag(folder)), asdict(evaluate_bag(copy))
+    one, two = asdict(evaluate_run(load_run(folder))), asdict(evaluate_run(load_run(copy)))
     for key in ("bag", "trial", "seed", "extra"):
         one.pop(key)
         two.pop(key)
@@ -113,7 +112,7 @@ def test_clocks_that_are_off_are_named_in_the_report(tmp_path: Path):
     status = [replace(silent, name="/limb/tracker", values=told), silent]
     bag.write("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray", 0.0, status=status)
     bag.travel = -0.025
-    result = evaluate_bag(bag.still_run())
+    result = evaluate_run(load_run(bag.still_run()))
     assert result.extra == {"clocks": "/limb/tracker +30.00 ± 0.20 ms"}
     assert result.problems == ("stamps come from up to 25 ms in the future: see `clocks`",)
 
@@ -161,13 +160,13 @@ def test_bag_without_plan_or_states_is_refused(tmp_path: Path):
     bag.state(0.0, (0.2, 0.0))
     bag.bag.close()
     with pytest.raises(EvaluationError, match=r"no_plan: holds no der_msgs/msg/PressurePlan"):
-        evaluate_bag(tmp_path / "no_plan")
+        load_run(tmp_path / "no_plan")
     bag = BagOfRun(tmp_path / "no_state")
     bag.plan()
     bag.setpoint(0, [0.0, 0.0])
     bag.bag.close()
     with pytest.raises(EvaluationError, match="did the tracker run"):
-        evaluate_bag(tmp_path / "no_state")
+        load_run(tmp_path / "no_state")
 
 
 def test_the_plan_that_was_played_is_chosen(tmp_path: Path):
@@ -238,7 +237,7 @@ def test_a_run_among_several_limbs_is_named(tmp_path: Path):
 
 
 def test_loads_of_a_bag_are_those_of_its_plan(tmp_path: Path):
-    result = evaluate_bag(BagOfRun(tmp_path / "hung").still_run(**HUNG))
+    result = evaluate_run(load_run(BagOfRun(tmp_path / "hung").still_run(**HUNG)))
     assert (result.mounting, result.gravity_m_s2) == ("hanging", (9.81, 0.0, 0.0))
     assert (result.payload_kg, result.payload_at_m) == (0.02, 0.244)
     assert "hanging, 20 g at 24.4 cm" in format_table(summarise([result]))
@@ -254,6 +253,6 @@ def test_the_last_revision_of_a_setpoint_counts(tmp_path: Path):
         bag.command(time + 0.004, [1500.0, -1500.0], index)
         bag.state(time + 0.01, reference(time + 0.01)[0])
     bag.bag.close()
-    result = evaluate_bag(tmp_path / "run")
+    result = evaluate_run(load_run(tmp_path / "run"))
     assert result.checks["board_lost"] == 0
     assert result.extra["feedback"]["correction_max_pa"] == [1500.0, 1500.0]

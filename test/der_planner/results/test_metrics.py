@@ -2,13 +2,12 @@
 
 import numpy as np
 import pytest
-from runs import CYCLES, FRAMES, PERIOD, TIMES, reference, series
+from runs import FRAMES, TIMES, reference, series
 
 from der_planner.bags.run import PressureArrays
 from der_planner.results import (
     Description,
     EvaluationError,
-    EvaluationSettings,
     RunSeries,
     evaluate_run,
 )
@@ -47,19 +46,6 @@ def test_only_frames_between_first_and_last_setpoint_count():
     assert result.frames == int((~outside).sum())
 
 
-def test_cycles_window_leaves_out_fade_in_and_closing_move():
-    tip = reference(FRAMES).copy()
-    tip[FRAMES < PERIOD / 4] += 0.5
-    tip[FRAMES > PERIOD * CYCLES] += 0.5
-    settings = EvaluationSettings(window="cycles")
-    assert evaluate_run(series(tip), settings).max_error_m < 5e-5
-    assert evaluate_run(series(tip)).max_error_m > 0.5
-    with pytest.raises(EvaluationError, match="0 cycles"):
-        evaluate_run(series(tip, cycles=0), settings)
-    with pytest.raises(EvaluationError, match="window 'ramp' is unknown"):
-        EvaluationSettings(window="ramp")
-
-
 @pytest.mark.parametrize("lag", [-0.2, 0.013, 0.35])
 def test_lag_gain_and_bias_are_told_apart(lag: float):
     late = reference(FRAMES - lag)
@@ -74,14 +60,11 @@ def test_lag_gain_and_bias_are_told_apart(lag: float):
     assert found.rms_without_gain_m == pytest.approx(2e-4 * np.sqrt(2), rel=0.2)
 
 
-def test_nothing_is_shifted_unless_asked():
-    tip = reference(FRAMES - 0.3)
-    plain = evaluate_run(series(tip))
-    shifted = evaluate_run(series(tip), EvaluationSettings(remove_lag=True))
-    assert plain.removed_lag_s == 0.0
-    assert plain.mean_error_m > 0.01
-    assert shifted.removed_lag_s == pytest.approx(0.3, abs=1e-3)
-    assert shifted.mean_error_m < 1e-3
+def test_nothing_is_shifted():
+    late = evaluate_run(series(reference(FRAMES - 0.3)))
+    assert late.mean_error_m > 0.01
+    assert late.lag_s == pytest.approx(0.3, abs=1e-3)
+    assert late.rms_without_lag_m < 1e-3
 
 
 def test_reference_that_rests_has_no_lag():

@@ -73,7 +73,6 @@ def test_unpaired_trials_and_single_trials():
         ({"period_s": 6.0}, "different period: 4 s, 6 s"),
         ({"amplitude_rad": 0.5}, "different amplitude: 0.5 rad, 0.7 rad"),
         ({"problems": ("the driver reported a fault: x",)}, "fault"),
-        ({"removed_lag_s": 0.1}, "lag was removed from some"),
         ({"window_s": (1.0, 8.0)}, "different windows"),
         (
             {"reference_points_m": tuple((x, y + 0.006) for x, y in DER[0].reference_points_m)},

@@ -5,7 +5,7 @@ import pytest
 
 from der_planner.model.air import pair_of
 from der_planner.twin import TwinError
-from der_planner.twin.offline import play
+from der_planner.twin.offline import LEAD, play
 from pressure_driver.emulator.pneumatics import BoardPneumatics
 
 
@@ -26,8 +26,10 @@ def test_rows_are_what_was_before_the_setpoint():
 def test_limb_feels_the_boards_pneumatics():
     time = np.arange(30) * 0.05
     pressure = np.tile([0.0, -4000.0], (30, 1))
-    result = play(time, pressure, seed=3, lead=0.0)
+    result = play(time, pressure, seed=3)
     air = BoardPneumatics(2, 3)
+    for _ in range(round(LEAD / 0.01)):
+        air.step(0.01)
     expected = []
     for row in pressure:
         expected.append(air.pressure)

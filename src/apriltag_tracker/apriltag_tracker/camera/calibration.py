@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
 from apriltag_tracker.camera.pinhole import Intrinsics
 from apriltag_tracker.pipeline import LimbTracker
 from apriltag_tracker.sheets import BoardLayout
-from apriltag_tracker.tag_map import LimbTag, TagMap
+from apriltag_tracker.tag_map import TagMap
 
 Array = NDArray[np.float64]
 
@@ -231,23 +233,11 @@ def calibrate_mounting(
     return MountingCalibration(offsets, scatter, count)
 
 
-def with_offsets(text: str, tags: Sequence[LimbTag], result: MountingCalibration) -> str:
-    """Return the text of a tag map with new offsets; its comments stay.
-
-    Raises:
-        CalibrationError: the line of a tag cannot be found, as it is written in another way.
-    """
-    lines = text.split("\n")
-    for tag in tags:
-        along, across, turn = result.offsets[tag.id]
-        new = f"offset: [{along:.6f}, {across:.6f}, {turn:.5f}]"
-        for k, line in enumerate(lines):
-            if f"id: {tag.id}," in line and "arc_length" in line:
-                head = line.split(", offset:")[0].rstrip().rstrip("}")
-                lines[k] = f"{head}, {new}}}"
-                break
-        else:
-            raise CalibrationError(
-                f"no line '- {{id: {tag.id}, arc_length: …}}' in the tag map: enter {new} by hand"
-            )
-    return "\n".join(lines)
+def with_offsets(text: str, result: MountingCalibration) -> str:
+    """Return the text of a tag map with new offsets; the comments at its head stay."""
+    head = itertools.takewhile(lambda line: line.startswith("#"), text.splitlines(keepends=True))
+    content = yaml.safe_load(text)
+    for tag in content["limb"]["tags"]:
+        along, across, turn = result.offsets[tag["id"]].tolist()
+        tag["offset"] = [round(along, 6), round(across, 6), round(turn, 5)]
+    return "".join(head) + yaml.safe_dump(content, sort_keys=False, default_flow_style=None)

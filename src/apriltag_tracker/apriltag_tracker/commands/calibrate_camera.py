@@ -20,7 +20,6 @@ from pathlib import Path
 
 import numpy as np
 import rclpy
-import yaml
 from ament_index_python.packages import get_package_share_directory
 from numpy.typing import NDArray
 from rclpy.node import Node
@@ -168,9 +167,7 @@ def mounting(options: argparse.Namespace) -> None:
             f"{tag:3d}  {1e3 * along:10.3f}  {1e3 * across:11.3f}  {np.degrees(turn):10.3f}   "
             f"{1e3 * spread[0]:.3f}, {1e3 * spread[1]:.3f}, {np.degrees(spread[2]):.3f}"
         )
-    text = with_offsets(options.tag_map.read_text(), tags.limb, result)
-    TagMap.from_dict(yaml.safe_load(text))
-    options.out.write_text(text)
+    options.out.write_text(with_offsets(options.tag_map.read_text(), result))
     print(f"written to {options.out}, from {result.pictures} pictures")
 
 

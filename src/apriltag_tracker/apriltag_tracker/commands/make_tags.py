@@ -23,7 +23,6 @@ from apriltag_tracker.sheets import (
     given_board,
     tag_pages,
     write_pdf,
-    write_svg,
 )
 from apriltag_tracker.tag_map import MapError, TagMap
 
@@ -32,15 +31,9 @@ DEFAULT_MAP = Path(get_package_share_directory("apriltag_tracker")) / "config" /
 
 def _write(pages: list[Page], name: str, options: argparse.Namespace) -> None:
     options.out.mkdir(parents=True, exist_ok=True)
-    if options.format == "pdf":
-        path = options.out / f"{name}.pdf"
-        write_pdf(pages, path)
-        print(path)
-        return
-    for number, page in enumerate(pages, 1):
-        path = options.out / (f"{name}_{number}.svg" if len(pages) > 1 else f"{name}.svg")
-        write_svg(page, path)
-        print(path)
+    path = options.out / f"{name}.pdf"
+    write_pdf(pages, path)
+    print(path)
 
 
 def main() -> int:
@@ -51,7 +44,6 @@ def main() -> int:
     what = parser.add_subparsers(dest="what", required=True)
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument("--paper", choices=sorted(PAPERS), default="a4")
-    common.add_argument("--format", choices=("pdf", "svg"), default="pdf")
     common.add_argument("--out", type=Path, default=Path("sheets"), metavar="DIR")
     tags = what.add_parser("tags", parents=[common], help="every tag of a tag map")
     tags.add_argument("--tag-map", type=Path, default=DEFAULT_MAP, metavar="FILE")

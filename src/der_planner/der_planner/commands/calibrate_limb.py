@@ -35,7 +35,6 @@ from pathlib import Path
 import numpy as np
 
 from der_planner.experiment.console import (
-    Loads,
     OptionError,
     Progress,
     add_load_options,
@@ -43,6 +42,7 @@ from der_planner.experiment.console import (
     check_folder,
     check_limb_file,
     command_parser,
+    given_load,
     interrupt_once,
     run_command,
 )
@@ -72,7 +72,7 @@ from der_planner.identification.readers import is_ours, read_table
 from der_planner.identification.report import plot_prediction
 from der_planner.identification.stiffness import FREE, REST
 from der_planner.identification.terms import GROUPS
-from der_planner.limb import Limb, LimbError
+from der_planner.limb import Limb, LimbError, Load
 from der_planner.model import CONTROL_PERIOD
 from der_planner.planning.loads import nearly_buckling
 from pressure_driver.settings import Settings
@@ -95,10 +95,10 @@ def main() -> int:
 
 def _main(given: argparse.Namespace) -> int:
     _check(given)
-    loads = Loads.given(given)
+    load = given_load(given)
     bare = Limb.from_yaml(given.prior) if given.prior else Limb.default()
     try:
-        prior = loads.loaded(bare if given.mass is None else bare.weighing(given.mass))
+        prior = (bare if given.mass is None else bare.weighing(given.mass)).loaded(load)
         if given.weight is not None:
             prior.carrying(given.weight, given.at, name="weight")  # refuses what cannot hang there
     except LimbError as error:
@@ -120,9 +120,9 @@ def _main(given: argparse.Namespace) -> int:
     if given.log is not None and not given.held_out and given.weight is None:
         log, rest = log.parted(LAST_PART)
         kept_back = [dataclasses.replace(rest, source=f"the end of {rest.source}, not shown")]
-    limb, report = _fit(prior, log, loads, given)
+    limb, report = _fit(prior, log, load, given)
     unseen = [*kept_back, *held_out]
-    kept = loads.unloaded(limb)
+    kept = _unloaded(limb, load)
     lines = [report.text(), *(_held_out_text(limb, each, given.longest_gap) for each in unseen)]
     text = "\n".join([*lines, _weight(kept, given)])
     print(text)
@@ -269,8 +269,13 @@ def _check(given: argparse.Namespace) -> None:
         check_folder(given.report, "--report")
 
 
+def _unloaded(limb: Limb, load: Load) -> Limb:
+    """Return a limb without the payload of a load, which was put on last."""
+    return dataclasses.replace(limb, masses=limb.masses[:-1]) if load.payload else limb
+
+
 def _fit(
-    prior: Limb, log: CalibrationLog, loads: Loads, given: argparse.Namespace
+    prior: Limb, log: CalibrationLog, load: Load, given: argparse.Namespace
 ) -> tuple[Limb, FitReport]:
     """Fit; a limb that was weighed weighs the same with the lengths that were found."""
     terms = [*given.terms, *(["mass"] if given.fit_mass else [])]
@@ -278,7 +283,7 @@ def _fit(
     limb, report = fit(prior, log, terms=terms, longest_gap=given.longest_gap, weight=weight)
     if given.mass is None:
         return limb, report
-    found = loads.unloaded(limb)
+    found = _unloaded(limb, load)
     off = found.mass / given.mass - 1.0
     if abs(off) > SAME_MASS:
         print(

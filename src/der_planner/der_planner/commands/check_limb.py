@@ -21,11 +21,12 @@ import sys
 from pathlib import Path
 
 from der_planner.experiment.console import (
-    Loads,
     OptionError,
     add_load_options,
     check_limb_file,
     command_parser,
+    given_load,
+    loaded,
     run_command,
 )
 from der_planner.identification import CalibrationLog, LogError, check, read_log, update
@@ -43,15 +44,14 @@ def _main(given: argparse.Namespace) -> int:
         if not given.update:
             raise OptionError("--out is the updated limb file: give --update, too")
         check_limb_file(given.out)
-    loads = Loads.given(given)
     limb = Limb.from_yaml(given.limb)
-    loaded = loads.loaded(limb)
-    if loaded.other_mounting:
-        print(f"warning: {loaded.other_mounting}", file=sys.stderr)
+    under_load = loaded(limb, given_load(given))
+    if under_load.other_mounting:
+        print(f"warning: {under_load.other_mounting}", file=sys.stderr)
     logs = [read_log(path, given.columns, given.namespace) for path in given.runs]
     if given.update:
-        return _update(limb, loaded, logs, given.out)
-    return max([_check(loaded, log, len(logs) > 1) for log in logs])
+        return _update(limb, under_load, logs, given.out)
+    return max([_check(under_load, log, len(logs) > 1) for log in logs])
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -23,7 +23,6 @@ from der_planner.experiment.console import (
     run_command,
 )
 from der_planner.results import (
-    EvaluationSettings,
     RunSeries,
     compare,
     evaluate_bags,
@@ -32,7 +31,6 @@ from der_planner.results import (
     write_report,
     write_results,
 )
-from der_planner.results.errors import WINDOWS
 from der_planner.results.overlay import write_video
 
 
@@ -53,17 +51,6 @@ def _arguments() -> argparse.Namespace:
         type=Path,
         metavar="FILE",
         help="film of the first bag: .mp4, or .webp for a page",
-    )
-    parser.add_argument(
-        "--window",
-        choices=WINDOWS,
-        default="plan",
-        help="plan: every setpoint; cycles: without fade-in and closing move (default: plan)",
-    )
-    parser.add_argument(
-        "--remove-lag",
-        action="store_true",
-        help="estimate a constant lag of each run and take it out before computing E",
     )
     parser.add_argument(
         "--contact",
@@ -99,9 +86,8 @@ def _evaluate(given: argparse.Namespace) -> int:
             check_folder(getattr(given, name), f"--{name}")
     if given.video is not None:
         check_file(given.video, "--video")
-    settings = EvaluationSettings(window=given.window, remove_lag=given.remove_lag)
     progress, bags, found = Progress(), expand(given.bags), []
-    for entry in evaluate_bags(bags, settings):
+    for entry in evaluate_bags(bags):
         found.append(entry)
         progress.bar(bags.index(entry.path) + 1, len(bags), entry.path.name, unit="bags read")
         if entry.error:
@@ -111,9 +97,6 @@ def _evaluate(given: argparse.Namespace) -> int:
     if not results:
         return 1
     print(format_table(summarise(results), compare(results)))
-    for result in results:
-        if result.removed_lag_s:
-            print(f"{result.bag}: a lag of {result.removed_lag_s * 1000:.0f} ms was taken out")
     if given.results is not None:
         print(write_results(results, given.results))
     if given.report is not None:

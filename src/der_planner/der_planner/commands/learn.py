@@ -22,7 +22,7 @@ import numpy as np
 from der_planner.control import Learner, LearningError
 from der_planner.control.hindsight import Filmed, touches
 from der_planner.experiment.console import check_file, command_parser, run_command
-from der_planner.limb import Limb, LimbError
+from der_planner.limb import Limb, LimbError, Load
 from der_planner.planning import Motion, Obstacles, Plan, PlanningError, plan
 from der_planner.planning.motions import NAMES
 from der_planner.planning.plan_file import read_plan, write_plan
@@ -137,7 +137,7 @@ def plan_of(run: RunSeries, given: argparse.Namespace) -> Plan:
     limb = Limb.from_yaml(given.limb)
     if any(told.gravity):
         limb = dataclasses.replace(limb, gravity=told.gravity)
-    limb = limb.carrying(told.payload, told.payload_at or None)
+    limb = limb.loaded(Load(told.payload, told.payload_at))
     if given.path:
         motion = Motion.from_csv(given.path, nearest=DRAWN in told.extra)
     elif told.motion in NAMES:

@@ -30,6 +30,7 @@ from der_planner.experiment.console import (
     Progress,
     check_folder,
     interrupt_once,
+    loaded,
     run_command,
 )
 from der_planner.experiment.offline_run import load_arrays, play_offline
@@ -37,7 +38,7 @@ from der_planner.experiment.options import Options, Trial, TrialRun, parse
 from der_planner.experiment.processes import GraphError, NodeError
 from der_planner.files import write_whole
 from der_planner.identification import LogError, calibrate_twin
-from der_planner.limb import Limb, LimbError, mounting_of
+from der_planner.limb import Limb, LimbError, Load, mounting_of
 from der_planner.methods import LEARNED
 from der_planner.planning import PlanningError
 from der_planner.planning.correction import carried_over, nearest
@@ -106,7 +107,7 @@ def run(options: Options, progress: Progress | None = None) -> None:
     """
     progress = progress or Progress()
     try:
-        limb = options.loads.loaded(_read(options.limb))
+        limb = _read(options.limb).loaded(options.load)
     except LimbError as error:
         raise OptionError(str(error)) from error
     trials = options.plan_of_trials()
@@ -147,9 +148,9 @@ class Ledger:
             "cycles": options.cycles,
             "limb_sha256": _digest(options.limb),
             "path_sha256": _digest(options.path),
-            "mounting": options.loads.mounting,
-            "payload": options.loads.payload or "",
-            "payload_at": options.loads.payload_at or "",
+            "mounting": options.load.mounting,
+            "payload": options.load.payload or "",
+            "payload_at": options.load.payload_at or "",
             "calibrate": options.calibrate,
             "offline": options.offline,
             "poses": "yes" if options.poses else "",
@@ -204,7 +205,7 @@ def _digest(path: Path | None) -> str:
 def _play_trial(trial: Trial, options: Options, ledger: Ledger, progress: Progress) -> None:
     """Play a trial, and then what is learned from it; finished runs are not played again."""
     limb = _limb_file(trial, options, progress)
-    first = TrialRun(trial, options, limb, options.loads.loaded(_read(limb)))
+    first = TrialRun(trial, options, limb, loaded(_read(limb), options.load))
     if ledger.finished(trial) is None:
         ledger.record(trial, _play(first, progress))
     if not options.learn:
@@ -283,11 +284,11 @@ def _limb_file(trial: Trial, options: Options, progress: Progress) -> Path | Non
     """Return the limb file to plan with; the twin of a new seed is calibrated first."""
     if not options.calibrate:
         return options.limb
-    mounting = f"_{options.loads.mounting}" if options.loads.mounting else ""
+    mounting = f"_{options.load.mounting}" if options.load.mounting else ""
     path = options.out / "limbs" / f"seed_{trial.seed}{mounting}.yaml"
     if path.exists():
         return path
-    prior = options.loads.mounted(Limb.default())
+    prior = Limb.default().loaded(Load(mounting=options.load.mounting))
     if said := nearly_buckling(prior):
         progress.say(f"  warning: with the stiffness and mass of the default limb {said}")
     progress.say(f"  calibrating on the twin of seed {trial.seed}")

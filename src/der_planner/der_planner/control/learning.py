@@ -83,9 +83,6 @@ class LearningRun:
             seen [m].
         seen: share of the setpoints at which the tip was seen.
         accepted: the run was used.
-        step: α of the plan that follows it.
-        repeatability: mean distance between a run and the mean of many runs of one plan, as far as
-            it is known by now [m].
         reason: what was done with the run and why.
     """
 
@@ -93,8 +90,6 @@ class LearningRun:
     mean_error: float
     seen: float
     accepted: bool
-    step: float
-    repeatability: float
     reason: str
 
 
@@ -183,8 +178,8 @@ class Learner:
         if accepted and beyond is not None:
             self._beyond = beyond
         self._given = False
-        number, mean, repeats = len(self.history) + 1, float(missed.mean()), self.repeatability
-        run = LearningRun(number, mean, seen, accepted, self._step, repeats, said)
+        number, mean = len(self.history) + 1, float(missed.mean())
+        run = LearningRun(number, mean, seen, accepted, said)
         self.history.append(run)
 
     def next(self) -> Plan:

@@ -83,8 +83,6 @@ class Played:
         reference: (K, 2) r̄ [m].
         correction: (K, M) what feedback added to the plan's commands [Pa].
         estimated_tip: (K, 2) as estimated at its own instant [m]; NaN without feedback.
-        missing_pressure: (K, M) effective pressure that the model was found to lack, the error of
-            its gain included [Pa]; NaN without feedback.
     """
 
     time: Array
@@ -95,7 +93,6 @@ class Played:
     reference: Array
     correction: Array
     estimated_tip: Array
-    missing_pressure: Array
 
     @property
     def error(self) -> Array:
@@ -138,17 +135,13 @@ def play(
         if told is not None:
             told.inform(instant)
         commands.append(command(k + ahead))
-        estimated = (np.full(2, np.nan), np.full(segments, np.nan))
-        if feedback is not None:
-            estimate = feedback.estimate(instant)
-            lacking = estimate.missing_pressure + estimate.gain_error * estimate.effective_pressure
-            estimated = estimate.tip, lacking
+        estimated = np.full(2, np.nan) if feedback is None else feedback.estimate(instant).tip
         # A plant may change its own arrays in place.
         state = map(np.array, (plant.differential_pressure, plant.bend_angles, plant.tip))
-        rows.append((commands[k], *state, *estimated))
+        rows.append((commands[k], *state, estimated))
         _advance(plant, commands[k], instant, sensors.frame_rate, event, told)
     columns = [np.array(column) for column in zip(*rows, strict=True)]
-    commanded, differential, bend, tip, estimated_tip, missing = columns
+    commanded, differential, bend, tip, estimated = columns
     return Played(
         plan.time,
         commanded,
@@ -157,8 +150,7 @@ def play(
         tip,
         plan.tip_reference,
         commanded - planned,
-        estimated_tip,
-        missing,
+        estimated,
     )
 
 

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import os
 import signal
 import sys
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 
-from der_planner.limb import Limb, LimbError
+from der_planner.limb import Limb, LimbError, Load
 
 
 class OptionError(ValueError):
@@ -188,53 +186,27 @@ def folder_argument(text: str) -> Path:
 # Loads -------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Loads:
-    """How a command line mounts and loads a limb.
+def given_load(given: argparse.Namespace) -> Load:
+    """Return the load of a command line that has `add_load_options`.
 
-    Attributes:
-        mounting: see `Limb.mounted`; empty for the gravity of the limb file.
-        payload: carried in the run, beside the masses of the limb file [kg].
-        payload_at: where, along the limb from its clamp [m]; None for the tip.
+    Raises:
+        OptionError: the place of no payload.
     """
+    if given.payload_at is not None and not given.payload:
+        raise OptionError("--payload-at is the place of a payload: give --payload, too")
+    return Load(given.payload, given.payload_at or 0.0, given.mounting)
 
-    mounting: str = ""
-    payload: float = 0.0
-    payload_at: float | None = None
 
-    @classmethod
-    def given(cls, given: argparse.Namespace) -> Loads:
-        """Return the loads of a command line that has `add_load_options`.
+def loaded(limb: Limb, load: Load) -> Limb:
+    """Return a limb under the load of a command line.
 
-        Raises:
-            OptionError: the place of no payload.
-        """
-        if given.payload_at is not None and not given.payload:
-            raise OptionError("--payload-at is the place of a payload: give --payload, too")
-        return cls(given.mounting, given.payload, given.payload_at)
-
-    def mounted(self, limb: Limb) -> Limb:
-        """Return a limb as it is mounted here, without the payload.
-
-        Raises:
-            LimbError: the mounting is unknown.
-        """
-        return limb.mounted(self.mounting) if self.mounting else limb
-
-    def loaded(self, limb: Limb) -> Limb:
-        """Return a limb as it is mounted here, with the payload.
-
-        Raises:
-            OptionError: the mounting is unknown, or the payload is too heavy or not on the limb.
-        """
-        try:
-            return self.mounted(limb).carrying(self.payload, self.payload_at)
-        except LimbError as error:
-            raise OptionError(str(error)) from error
-
-    def unloaded(self, limb: Limb) -> Limb:
-        """Return a limb of `loaded` without the payload, which was put on last."""
-        return dataclasses.replace(limb, masses=limb.masses[:-1]) if self.payload else limb
+    Raises:
+        OptionError: the mounting is unknown, or the payload is too heavy or not on the limb.
+    """
+    try:
+        return limb.loaded(load)
+    except LimbError as error:
+        raise OptionError(str(error)) from error
 
 
 def add_load_options(parser: argparse.ArgumentParser | argparse._ArgumentGroup) -> None:
@@ -256,5 +228,5 @@ def add_load_options(parser: argparse.ArgumentParser | argparse._ArgumentGroup) 
         "--payload-at",
         type=float,
         metavar="M",
-        help="where the payload sits, along the limb from its clamp (without it: the tip)",
+        help="where the payload sits, along the limb from its clamp (0, or without it: the tip)",
     )

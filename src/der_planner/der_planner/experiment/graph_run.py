@@ -307,9 +307,9 @@ def experiment_page(options: Options, progress: Progress) -> Iterator[NodeProces
         GraphError: it is not ready in time.
     """
     planner: dict[str, Any] = {
-        "limb_file": str(options.limb or ""), "mounting": options.loads.mounting,
+        "limb_file": str(options.limb or ""), "mounting": options.load.mounting,
     }  # fmt: skip
-    planner |= {"payload": options.loads.payload, "payload_at": options.loads.payload_at or 0.0}
+    planner |= {"payload": options.load.payload, "payload_at": options.load.payload_at}
     setup = GraphSetup(Path(), {}, hardware=options.hardware, planner=planner, page=options.page)
     (spec,) = [each for each in setup.nodes("") if each.executable == "page"]
     parameters = {**spec.parameters, "report": str(options.out / "report")}

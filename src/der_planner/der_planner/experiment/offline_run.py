@@ -53,11 +53,8 @@ def play_offline(run: TrialRun, progress: Progress) -> dict[str, Any]:
         tip_reference=planned.tip_reference,
         tip_predicted=planned.tip_predicted,
         differential_pressure=played.commanded,
-        planned_pressure=planned.differential_pressure,
         measured_differential=played.differential_pressure,
         tip=played.tip,
-        tip_estimated=played.estimated_tip,
-        missing_pressure=played.missing_pressure,
     )
     return {"arrays": str(path.relative_to(run.options.out))}
 

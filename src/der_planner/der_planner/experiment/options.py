@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from der_planner.control.reaction import KINDS, Kind
-from der_planner.experiment.console import Loads, OptionError, add_load_options
+from der_planner.experiment.console import OptionError, add_load_options, given_load
 from der_planner.experiment.processes import Hardware
-from der_planner.limb import Limb
+from der_planner.limb import Limb, Load
 from der_planner.methods import LEARNED
 from der_planner.model import Model, RodModel
 from der_planner.planning import METHODS as METHODS_BY_MODEL
@@ -140,7 +140,7 @@ class Options:
     seed: int = _option(
         1, "of the first trial's twin; the next trial has the next seed", (0, 2**31 - 1000)
     )
-    loads: Loads = field(default_factory=Loads)
+    load: Load = Load()
     board: str = _option(BOARDS[0], "of the twin", choices=BOARDS)
     obstacles: Path | None = _option(
         None,
@@ -282,7 +282,7 @@ def parser() -> argparse.ArgumentParser:
         epilog="Without options: Case 2 (same_direction), DER and PCC, one trial each, on the twin",
     )
     for each in dataclasses.fields(Options):
-        if each.name == "loads":
+        if each.name == "load":
             add_load_options(result)
             continue
         told = {key: value for key, value in each.metadata.items() if key != "within"}
@@ -314,7 +314,7 @@ def parse(arguments: Sequence[str]) -> Options:
             name, (least, most) = each.name.replace("_", "-"), within
             text = each.metadata["help"]
             raise OptionError(f"--{name} is {value}: choose {least} to {most} ({text})")
-    loads = Loads.given(given)
+    load = given_load(given)
     motions = _motions(given)
     models = tuple(dict.fromkeys(given.models))
     hardware = Hardware.from_yaml(given.hardware) if given.hardware else None
@@ -367,7 +367,7 @@ def parse(arguments: Sequence[str]) -> Options:
     ):
         if wrong:
             raise OptionError(said)
-    values |= {"motions": motions, "models": models, "loads": loads, "hardware": hardware}
+    values |= {"motions": motions, "models": models, "load": load, "hardware": hardware}
     values |= {"limb": limb, "calibrate": limb is None and given.calibrate}
     if given.path is not None:
         # A path has neither amplitude nor period: the plan says so in the same way.

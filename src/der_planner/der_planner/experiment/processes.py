@@ -19,6 +19,7 @@ from typing import Any
 import yaml
 
 from der_planner.experiment.console import OptionError
+from der_planner.files import read_yaml
 from der_planner.limb import Limb
 from der_planner.planning import Obstacles
 from pressure_driver.protocols import order_of
@@ -97,10 +98,7 @@ class Hardware:
         Raises:
             OptionError: the file cannot be read, has unknown keys or no serial port.
         """
-        try:
-            content = yaml.safe_load(path.read_text(encoding="utf-8"))
-        except (OSError, yaml.YAMLError) as error:
-            raise OptionError(f"cannot read hardware file {path}: {error}") from error
+        content = read_yaml(path, "hardware file", OptionError)
         known = [item.name for item in dataclasses.fields(cls) if item.name != "hosts"]
         if not isinstance(content, dict):
             raise OptionError(f"hardware file {path}: a mapping is expected; keys: {known}")

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from der_planner.arrays import Array
+from der_planner.files import read_yaml
 from der_planner.identification.foreign import (
     LONGEST_SILENCE,
     bends_of,
@@ -131,10 +131,7 @@ class ColumnMap:
         Raises:
             LogError: the file cannot be read, or a key is unknown, missing or of another kind.
         """
-        try:
-            content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-        except (OSError, yaml.YAMLError) as error:
-            raise LogError(f"cannot read the column map {path}: {error}") from error
+        content = read_yaml(path, "the column map", LogError)
         if not isinstance(content, Mapping):
             raise LogError(f"the column map {path} must hold keys and values")
         known, given = {item.name for item in fields(cls)}, set(content)

@@ -20,7 +20,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from der_planner.files import write_whole
+from der_planner.files import read_yaml, write_whole
 from der_planner.limb.declaration import (
     LimbError,
     Parameter,
@@ -36,6 +36,7 @@ from der_planner.limb.declaration import (
 from der_planner.limb.loads import (
     BEYOND_THE_TIP,
     PAYLOAD,
+    Load,
     PointMass,
     gravity_of,
     mounting_of,
@@ -235,6 +236,15 @@ class Limb:
         mass = PointMass(place, float(payload), name)
         return dataclasses.replace(self, masses=(*self.masses, mass))
 
+    def loaded(self, load: Load) -> Limb:
+        """Return the limb under a load, as `mounted` and `carrying` say.
+
+        Raises:
+            LimbError: the mounting is unknown, or the payload is too heavy or not on the limb.
+        """
+        mounted = self.mounted(load.mounting) if load.mounting else self
+        return mounted.carrying(load.payload, load.payload_at or None)
+
     @property
     def payload(self) -> tuple[float, float]:
         """What only this run carries: its mass [kg], and where along the limb [m]; 0 is the tip."""
@@ -278,13 +288,7 @@ class Limb:
             LimbError: the file is missing, is not YAML, or a key is missing, unknown, of the wrong
                 type or out of range; the message names the file and the key.
         """
-        path = Path(path)
-        try:
-            content = yaml.safe_load(path.read_text(encoding="utf-8"))
-        except OSError as error:
-            raise LimbError(f"cannot read limb file {path}: {error.strerror}") from error
-        except (yaml.YAMLError, UnicodeDecodeError) as error:
-            raise LimbError(f"limb file {path} is not valid YAML: {error}") from error
+        content = read_yaml(path, "limb file", LimbError)
         try:
             return cls.from_mapping(content)
         except (LimbError, TypeError, ValueError) as error:

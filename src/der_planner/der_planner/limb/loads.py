@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from der_planner.limb.declaration import LimbError, parameter
 
@@ -63,6 +64,20 @@ class PointMass:
         interval="[0, inf)",
     )
     name: str = "mass"
+
+
+class Load(NamedTuple):
+    """How a limb is mounted and what it carries, as a command or a command line says it.
+
+    Attributes:
+        payload: [kg] carried beside the limb's own masses.
+        payload_at: [m] where, along the limb from its clamp; 0: the tip.
+        mounting: a name or degrees of tilt, see the module; empty: as the limb is mounted already.
+    """
+
+    payload: float = 0.0
+    payload_at: float = 0.0
+    mounting: str = ""
 
 
 def mounting_of(gravity: Sequence[float]) -> str:

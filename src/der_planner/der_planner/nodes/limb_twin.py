@@ -198,8 +198,6 @@ class LimbTwinNode(Node):
             messages = self._messages
         values = {
             "real_time_factor": f"{loop.real_time_factor:.4f}",
-            "largest_possible_factor": f"{loop.capacity:.1f}",
-            "busy": f"{loop.busy:.3f}",
             "lag_s": f"{loop.lag:.4f}",
             "dropped_s": f"{loop.dropped:.3f}",
             "simulated_s": f"{self._twin.time:.2f}",

@@ -20,10 +20,10 @@ from rclpy.node import Node
 
 from der_msgs.action import PlayMotion
 from der_msgs.msg import LimbState, MotionCommand
-from der_planner.arrays import Array
+from der_planner.arrays import Array, points_of
 from der_planner.control.feedback import Feedback
 from der_planner.control.reaction import KINDS, Kind
-from der_planner.limb import HEAVIEST, Limb
+from der_planner.limb import HEAVIEST, Limb, Load
 from der_planner.methods import LEARNED
 from der_planner.planning import METHODS, Motion, Obstacles, PathLimits, choose_method
 from der_planner.planning.motions import DEFAULT_AMPLITUDE, DEFAULT_CYCLES, DEFAULT_PERIOD
@@ -101,7 +101,7 @@ def read_parameters(node: Node) -> PlannerOptions:
         "of them in place of its motion"
     )  # fmt: skip
     options = PlannerOptions(
-        limb=limb.mounted(mounting) if mounting else limb,
+        limb=limb.loaded(Load(mounting=mounting)),
         limb_file=str(Path(limb_file).absolute()) if limb_file else "",
         payload=read(
             "payload", 0.0, "mass [kg] carried beside the limb's own masses, where a command names "
@@ -239,7 +239,7 @@ def from_command(message: MotionCommand, options: PlannerOptions, now: int) -> R
             raise ValueError(
                 "the command has a path, and a motion or a learned plan beside it: give one of them"
             )
-        tip = np.array([(point.x, point.y) for point in message.path])
+        tip = points_of(message.path)
         motion = _along_path(None, tip, options, message.nearest_path or options.nearest_path)
     elif message.method != LEARNED:
         motion = Motion.named(
@@ -261,10 +261,10 @@ def from_path(message: PathMessage, plan_id: str, options: PlannerOptions, now: 
     frame = message.header.frame_id
     if frame not in ("", topics.BASE_FRAME):
         raise ValueError(f"the path is in frame '{frame}': send it in '{topics.BASE_FRAME}'")
-    tip = np.array([(p.pose.position.x, p.pose.position.y) for p in message.poses])
+    tip = points_of(each.pose.position for each in message.poses)
     stamps = [nanoseconds(pose.header.stamp) for pose in message.poses]
     time = (np.array(stamps) - stamps[0]) * 1e-9 if any(stamps) else None
-    motion = _along_path(time, tip.reshape(-1, 2), options, options.nearest_path)
+    motion = _along_path(time, tip, options, options.nearest_path)
     return _request(MotionCommand(header=message.header, plan_id=plan_id), motion, options, now)
 
 
@@ -283,9 +283,8 @@ def _request(
     in place of it.
     """
     start = start_of(nanoseconds(message.header.stamp), now)
-    limb = options.limb.mounted(message.mounting) if message.mounting else options.limb
-    load = message if message.payload else options
-    limb = limb.carrying(load.payload, load.payload_at or None)
+    carried = message if message.payload else options
+    limb = options.limb.loaded(Load(carried.payload, carried.payload_at, message.mounting))
     model, learned = message.model or options.model, None
     if motion is None:
         learned = learned_plan(options.learned_plans, message.motion, limb)

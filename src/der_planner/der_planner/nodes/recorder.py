@@ -11,10 +11,8 @@ from pathlib import Path
 
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.serialization import serialize_message
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
-from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from der_planner.bags.session import RecordingSession
@@ -76,10 +74,8 @@ class Recorder(Node):
         self._last_bag = ""
         self._sources: dict[str, _Source] = {}
         self._refused: dict[str, str] = {}
-        self._marks = 0
         self.create_service(Trigger, "~/start", self._on_start)
         self.create_service(Trigger, "~/stop", self._on_stop)
-        self.create_service(Trigger, "~/mark", self._on_mark)
         self._discover()
         self._discovery = self.create_timer(0.25, self._discover)
         self._diagnostics = DiagnosticsPublisher(self, self._health)
@@ -106,7 +102,6 @@ class Recorder(Node):
             read_only=False,
         )
         declare("record_images", False, "record raw images, too", read_only=False)
-        declare("mark_label", "", "text of the next mark", read_only=False)
         declare("autostart", False, "start recording at once")
         declare("topics", ".*", "regular expression that the full topic names must match")
         declare(
@@ -242,7 +237,6 @@ class Recorder(Node):
             on_failure=self.get_logger().error,
         )
         self._last_failure = ""
-        self._marks = 0
         self._discover()
         now = self._now()
         for source in self._sources.values():
@@ -297,19 +291,6 @@ class Recorder(Node):
             response.message = self._last_failure or "not recording: start a recording first"
             return response
         response.success, response.message = self._stop()
-        return response
-
-    def _on_mark(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        if self._session is None:
-            response.message = "not recording: start a recording first"
-            return response
-        self._marks += 1
-        label = self._parameter("mark_label") or f"mark {self._marks}"
-        name = f"{self.get_fully_qualified_name()}/mark"
-        spec = TopicSpec.installed(name, "std_msgs/msg/String", (OfferedQos(),))
-        now = self._now()
-        response.success = self._session.put(spec, now, now, serialize_message(String(data=label)))
-        response.message = label
         return response
 
     def _health(self) -> Health:

@@ -7,7 +7,7 @@ import json
 import time
 import uuid
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
@@ -51,20 +51,6 @@ class Answer:
 
     success: bool
     message: str
-
-
-class Load(NamedTuple):
-    """How the limb is mounted and what it carries, as a motion command says it.
-
-    Attributes:
-        payload: [kg] carried beside the limb's own masses; 0: the planner's parameter.
-        payload_at: [m] where, along the limb from its clamp; 0: the tip.
-        mounting: a name or degrees of tilt; empty: the planner's parameter.
-    """
-
-    payload: float = 0.0
-    payload_at: float = 0.0
-    mounting: str = ""
 
 
 class Commands:

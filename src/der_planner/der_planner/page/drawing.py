@@ -23,9 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from der_planner.arrays import Array
-from der_planner.limb import Limb
+from der_planner.limb import Limb, Load
 from der_planner.model import ArcModel
-from der_planner.page.commands import Load
 from der_planner.planning import (
     Motion,
     PathLimits,
@@ -210,9 +209,8 @@ class Previewer:
         Raises:
             LimbError: no such mounting, or no such place on the limb.
         """
-        limb = self.limb.mounted(load.mounting) if load.mounting else self.limb
         carried = load if load.payload else self._carried
-        return limb.carrying(carried.payload, carried.payload_at or None)
+        return self.limb.loaded(carried._replace(mounting=load.mounting))
 
     def ask(self, limb: Limb, tip: Array, model: str = "der", method: str = "") -> Future[Preview]:
         """Plan a drawing (P, 2) [m] for a limb; the first starts the process and takes longer."""

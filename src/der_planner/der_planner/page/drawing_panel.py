@@ -15,7 +15,7 @@ from nicegui.events import GenericEventArguments
 
 from der_msgs.msg import MotionCommand
 from der_planner.arrays import Array
-from der_planner.page.commands import Load
+from der_planner.limb import Load
 from der_planner.page.drawing import DrawingError, Preview, drawn_pixels
 from der_planner.page.server import Parts
 from der_planner.page.situation import centimetres
@@ -67,7 +67,7 @@ class DrawingPanel:
         return self._playable is not None and bool(self._switch.value)
 
     def _run(self, function: str, *arguments: object) -> None:
-        """Call a function of draw.js in the window."""
+        """Call a function of drawing.js in the window."""
         given = ", ".join(json.dumps(each, separators=(",", ":")) for each in arguments)
         self._client.run_javascript(f"page.drawing.{function}({given})")
 

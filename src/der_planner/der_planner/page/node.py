@@ -36,9 +36,10 @@ from der_msgs.msg import (
     PressureState,
     TagDetectionArray,
 )
-from der_planner.limb import Limb, LimbError
+from der_planner.arrays import points_of
+from der_planner.limb import Limb, LimbError, Load
 from der_planner.page.access import Binding, Desk
-from der_planner.page.commands import Commands, Load
+from der_planner.page.commands import Commands
 from der_planner.page.drawing import DrawingFolder, Previewer
 from der_planner.page.picture import Overlay, PictureFeed
 from der_planner.page.server import PageServer, Parts
@@ -139,7 +140,7 @@ class PageNode(Node):
     def _read_limb(self, file: str) -> Limb:
         self._limb_file = file
         limb = Limb.from_yaml(file) if file else Limb.default()
-        return limb.mounted(self._mounting) if self._mounting else limb
+        return limb.loaded(Load(mounting=self._mounting))
 
     # What comes in -------------------------------------------------------------------------
 
@@ -187,8 +188,8 @@ class PageNode(Node):
 
     def _on_limb(self, message: LimbState) -> None:
         self._situation.put_limb(message)
-        curve = _points(message.curve if message.valid else [])
-        tip = _points([message.tip] if message.valid else [])
+        curve = points_of(message.curve if message.valid else [])
+        tip = points_of([message.tip] if message.valid else [])
         self._overlay.put_limb(nanoseconds(message.header.stamp), curve, tip)
 
     def _on_tags(self, message: TagDetectionArray) -> None:
@@ -208,12 +209,12 @@ class PageNode(Node):
 
     def _on_estimate(self, message: LimbEstimate) -> None:
         self._situation.put_estimate(message)
-        self._overlay.put_shape("estimate", _points(message.curve))
+        self._overlay.put_shape("estimate", points_of(message.curve))
 
     def _on_markers(self, message: MarkerArray) -> None:
         for marker in message.markers:
             if marker.ns == LIMB_MARKER:
-                self._overlay.put_shape("planned", _points(marker.points))
+                self._overlay.put_shape("planned", points_of(marker.points))
 
     def _on_camera(self, message: CameraInfo) -> None:
         self._overlay.put_camera(
@@ -289,11 +290,6 @@ class PageNode(Node):
         """Stop serving."""
         self._server.close()
         self._parts.previewer.close()
-
-
-def _points(points: Any) -> np.ndarray[Any, Any]:
-    """Return the points of a message as (P, 2) [m]."""
-    return np.array([(point.x, point.y) for point in points]).reshape(-1, 2)
 
 
 def create_executor() -> Executor:

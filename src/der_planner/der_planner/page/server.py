@@ -20,9 +20,9 @@ from fastapi import FastAPI, Response, WebSocket, WebSocketDisconnect
 from fastapi.responses import JSONResponse
 from fastapi.staticfiles import StaticFiles
 
-from der_planner.limb import LimbError
+from der_planner.limb import LimbError, Load
 from der_planner.page.access import AccessFilter, Binding, Desk
-from der_planner.page.commands import Commands, Load
+from der_planner.page.commands import Commands
 from der_planner.page.drawing import DrawingFolder, Previewer
 from der_planner.page.picture import Overlay, PictureFeed
 from der_planner.page.situation import Situation

@@ -23,9 +23,19 @@ import numpy as np
 from scipy.interpolate import BSpline, make_interp_spline
 
 from der_planner.arrays import Array, interpolate
-from der_planner.model import ArcModel, Initial, Model, RodModel, State
+from der_planner.model import (
+    CONTROL_PERIOD,
+    ArcModel,
+    Initial,
+    Model,
+    Response,
+    RodModel,
+    State,
+    simulate,
+)
 from der_planner.model.bending import TipNearPoses, TipOfBend, coordinates, inverse_kinematics
 from der_planner.model.rod import PoseFinder, Poses
+from der_planner.model.simulation import Bend
 from der_planner.planning.loads import (
     BucklingError,
     PlanningError,
@@ -94,6 +104,20 @@ class Configuration(ABC):
     def curves(self, time: Array) -> Array:
         """Return the centreline (K, P, 2) [m] at instants (K,) [s]."""
         return np.stack([self.model.kinematics.curve(bend) for bend in self.bend_at(time)])
+
+    def response(self, commands: Array, bend: Bend | None = None) -> Response:
+        """Return the model's response to commands (K, M) [Pa] from the motion's beginning.
+
+        Args:
+            commands: (K, M) [Pa].
+            bend: along which friction and creep act; None: along the bend that these commands lead
+                to.
+
+        Raises:
+            ConvergenceError: the model cannot be rolled forward under them.
+        """
+        instants = np.arange(len(commands)) * CONTROL_PERIOD
+        return simulate(self.model, instants, commands=commands, bend=bend, initial=self.initial)
 
     @property
     def initial(self) -> Initial:

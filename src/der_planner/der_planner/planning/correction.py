@@ -21,7 +21,7 @@ from threadpoolctl import ThreadpoolController
 from der_planner.arrays import Array, interpolate
 from der_planner.limb import Limb
 from der_planner.methods import LEARNED
-from der_planner.model import CONTROL_PERIOD, Model, simulate
+from der_planner.model import Model
 from der_planner.model.bending import inverse_kinematics
 from der_planner.model.simulation import Bend
 from der_planner.planning.configuration import configure
@@ -112,13 +112,7 @@ class Correction:
             PlanningError: the model cannot be rolled forward under them.
         """
         try:
-            response = simulate(
-                self.model,
-                np.arange(len(commands)) * CONTROL_PERIOD,
-                commands=commands,
-                bend=bend,
-                initial=self._configuration.initial,
-            )
+            response = self._configuration.response(commands, bend)
         except ConvergenceError as error:
             raise _not_followed(error) from error
         return Expected(response.tip[:-1], response.differential_pressure.mean(axis=1))

@@ -23,11 +23,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from scipy.ndimage import gaussian_filter1d
 from scipy.optimize import NonlinearConstraint, minimize
 
 from der_planner.arrays import Array
+from der_planner.files import read_yaml
 from der_planner.model import RodModel
 from der_planner.model.compliance import compliance
 from der_planner.planning.loads import PlanningError
@@ -149,12 +149,11 @@ class Obstacles:
         Raises:
             PlanningError: the file cannot be read or says something else; names it.
         """
+        content = read_yaml(path, "the file of obstacles", PlanningError)
         try:
-            content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
             return Obstacles.from_mapping(content)
-        except (OSError, yaml.YAMLError, ValueError, TypeError, KeyError) as error:
-            said = getattr(error, "strerror", None) or error
-            raise PlanningError(f"{path} cannot be used as a file of obstacles: {said}") from error
+        except (ValueError, TypeError, KeyError) as error:
+            raise PlanningError(f"{path} cannot be used as a file of obstacles: {error}") from error
 
     @staticmethod
     def from_mapping(content: Any) -> Obstacles:

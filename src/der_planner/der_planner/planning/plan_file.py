@@ -17,7 +17,7 @@ import numpy as np
 import yaml
 
 from der_planner.arrays import Array
-from der_planner.files import write_whole
+from der_planner.files import read_yaml, write_whole
 from der_planner.limb import Limb, LimbError
 from der_planner.model import CONTROL_PERIOD, NODES, Model
 from der_planner.model.commands import within_limits
@@ -156,10 +156,7 @@ def read_plan(path: str | Path) -> Plan:
     Raises:
         PlanningError: the file cannot be read, or is not a whole plan; names what is wrong.
     """
-    try:
-        content = yaml.load(Path(path).read_text(encoding="utf-8"), _Loader)
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise PlanningError(f"cannot read the plan {path}: {error}") from error
+    content = read_yaml(path, "the plan", PlanningError, _Loader)
     try:
         return _plan_of(content)
     except (KeyError, TypeError, ValueError, LimbError) as error:

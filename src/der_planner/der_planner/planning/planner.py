@@ -11,7 +11,7 @@ from threadpoolctl import ThreadpoolController
 
 from der_planner.arrays import Array
 from der_planner.limb import Limb
-from der_planner.model import CONTROL_PERIOD, NODES, Model, RodModel, simulate
+from der_planner.model import CONTROL_PERIOD, NODES, Model, RodModel
 from der_planner.model.commands import SlowVenting, slow_venting, within_limits
 from der_planner.model.commands import commands as commands_for
 from der_planner.planning.configuration import METHODS, Configuration, configure
@@ -179,7 +179,8 @@ def _solve(
         return solver.run(lambda share: report(0.4 + 0.6 * share))
     air, before = configuration.model.air, configuration.initial.before
     commands, cut = within_limits(wanted, air, CONTROL_PERIOD, before)
-    return Optimum(commands, tip_under(configuration, commands), 0, int(cut > _NOTABLE_CUT))
+    tip = configuration.response(commands, configuration.bend_at).tip[:-1]
+    return Optimum(commands, tip, 0, int(cut > _NOTABLE_CUT))
 
 
 def _led_past(
@@ -252,18 +253,6 @@ def balance(
     effective = configuration.pressures(method, fine)
     pressure = material.differential_pressure(fine, effective, configuration.bend_at(fine))
     return commands_for(air, fine, pressure, CONTROL_PERIOD), slow_venting(air, fine, pressure)
-
-
-def tip_under(configuration: Configuration, commands: Array) -> Array:
-    """Return the tip (K, 2) [m] of a model at the instants of commands (K, M) [Pa]."""
-    response = simulate(
-        configuration.model,
-        np.arange(len(commands)) * CONTROL_PERIOD,
-        commands=commands,
-        bend=configuration.bend_at,
-        initial=configuration.initial,
-    )
-    return response.tip[:-1]
 
 
 # Warnings --------------------------------------------------------------------------------------

@@ -3,7 +3,7 @@
 Example::
 
     run = load_run("bags/same_direction_der_1")  # or RunSeries.from_arrays(…)
-    result = evaluate_run(run)  # evaluate_bag does both
+    result = evaluate_run(run)
     print(format_table(summarise([result])))
     write_results([result], folder)  # folder/results.json
     plot_tip([run], folder)
@@ -13,8 +13,7 @@ Example::
 from der_planner.bags.reader import BagError
 from der_planner.bags.run import Description, EvaluationError, RunSeries
 from der_planner.bags.series import load_run
-from der_planner.results.errors import EvaluationSettings
-from der_planner.results.evaluation import RunResult, evaluate_bag, evaluate_bags, evaluate_run
+from der_planner.results.evaluation import RunResult, evaluate_bags, evaluate_run
 from der_planner.results.figures import plot_error, plot_learning, plot_pressures, plot_tip
 from der_planner.results.report import write_report, write_results
 from der_planner.results.statistics import compare, summarise
@@ -24,11 +23,9 @@ __all__ = [
     "BagError",
     "Description",
     "EvaluationError",
-    "EvaluationSettings",
     "RunResult",
     "RunSeries",
     "compare",
-    "evaluate_bag",
     "evaluate_bags",
     "evaluate_run",
     "format_table",

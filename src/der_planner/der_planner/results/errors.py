@@ -1,7 +1,7 @@
 """Errors over time: of the tip, what explains them, and of the instruments themselves.
 
 Measured and asked-for tip are compared at the same instants. Times come from stamps; nothing is
-shifted unless the settings ask for it. In a bag of the twin the tracker's tip is compared with the
+shifted. In a bag of the twin the tracker's tip is compared with the
 simulated one, and the board's log of commands with the setpoints.
 """
 
@@ -21,33 +21,12 @@ LARGEST_LAG = 1.0
 """Bound of the estimated lag [s]."""
 STANDSTILL = 1e-6
 """A reference that moves less [m] stands still."""
-WINDOWS = ("plan", "cycles")
 ROUNDING = 160.0
 """Largest difference [Pa] of a setpoint and its command: both chambers are rounded to 1 hPa."""
 ON_TIME = 0.025
 """Half the period of the setpoints [s]: a command nearer than that belongs to the setpoint."""
 LATEST = 0.5
 """A setpoint that reached the board later than this [s] is lost."""
-
-
-@dataclass(frozen=True)
-class EvaluationSettings:
-    """How a run is evaluated.
-
-    Attributes:
-        window: ``plan``: from the first to the last setpoint, so with the fade-in and the closing
-            move to rest; ``cycles``: without the first quarter of a period, in which the motion is
-            faded in, and up to the end of the last whole cycle.
-        remove_lag: shift the measured tip by the estimated lag before E is computed; the result
-            says by how much.
-    """
-
-    window: str = "plan"
-    remove_lag: bool = False
-
-    def __post_init__(self) -> None:
-        if self.window not in WINDOWS:
-            raise EvaluationError(f"window '{self.window}' is unknown: choose {', '.join(WINDOWS)}")
 
 
 @dataclass(frozen=True)
@@ -88,26 +67,23 @@ class ErrorSeries:
         return np.asarray(np.linalg.norm(self.error, axis=1))
 
 
-def error_series(run: RunSeries, settings: EvaluationSettings | None = None) -> ErrorSeries:
+def error_series(run: RunSeries) -> ErrorSeries:
     """Return the error at every valid image of the window.
 
     Raises:
         EvaluationError: there is no valid image in the window.
     """
-    settings = settings or EvaluationSettings()
-    lag = split_error(run, settings).lag_s if settings.remove_lag else 0.0
-    tip = _seen(run, *window(run, settings), lag)
+    tip = _seen(run, *window(run))
     return ErrorSeries(tip.time, tip.value - run.reference.at(tip.time))
 
 
-def _seen(run: RunSeries, first: float, last: float, lag: float = 0.0) -> Stream:
-    """Return the measured tip between two times, ``lag`` [s] earlier than it was measured.
+def _seen(run: RunSeries, first: float, last: float) -> Stream:
+    """Return the measured tip between two times.
 
     Raises:
         EvaluationError: it was never seen there.
     """
-    known = run.tip.known
-    found = Stream(known.time - lag, known.value).between(first, last)
+    found = run.tip.known.between(first, last)
     if not len(found):
         raise EvaluationError(
             f"{run.description.title}: no valid limb state between the first and the last setpoint"
@@ -115,26 +91,12 @@ def _seen(run: RunSeries, first: float, last: float, lag: float = 0.0) -> Stream
     return found
 
 
-def window(run: RunSeries, settings: EvaluationSettings) -> tuple[float, float]:
-    """Return the first and last instant that count [s].
-
-    Raises:
-        EvaluationError: the run has no cycles, or its plan ends before them.
-    """
-    first, last = float(run.reference.time[0]), float(run.reference.time[-1])
-    if settings.window == "plan":
-        return first, last
-    about = run.description
-    begin, end = 0.25 * about.period, about.period * about.cycles
-    if not first <= begin < end <= last + 1e-9:
-        raise EvaluationError(
-            f"{about.title}: has no window 'cycles': {about.cycles} cycles of {about.period:g} s "
-            f"in a plan of {last:.1f} s. Use the window 'plan'"
-        )
-    return begin, min(end, last)
+def window(run: RunSeries) -> tuple[float, float]:
+    """Return the instants of the first and the last setpoint [s]."""
+    return float(run.reference.time[0]), float(run.reference.time[-1])
 
 
-def split_error(run: RunSeries, settings: EvaluationSettings | None = None) -> Split:
+def split_error(run: RunSeries) -> Split:
     """Fit lag, gain and bias of the measured against the reference tip.
 
     The lag minimises what gains and mean leave of the squared distance of r(t) and r̄(t − τ), |τ| up
@@ -142,12 +104,11 @@ def split_error(run: RunSeries, settings: EvaluationSettings | None = None) -> S
 
     Args:
         run: with at least a few valid images.
-        settings: window.
 
     Raises:
         EvaluationError: there is no valid image in the window.
     """
-    first, last = window(run, settings or EvaluationSettings())
+    first, last = window(run)
     # The same samples for every lag, so that residuals compare.
     margin = min(LARGEST_LAG, 0.1 * (last - first))
     tip = run.tip.known.between(first + margin, last - margin)

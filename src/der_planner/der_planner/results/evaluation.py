@@ -20,10 +20,9 @@ from der_planner.arrays import Array
 from der_planner.bags.reader import BagError
 from der_planner.bags.record import read_record
 from der_planner.bags.run import EvaluationError, RunSeries
-from der_planner.bags.series import load_run, run_of
+from der_planner.bags.series import run_of
 from der_planner.limb import mounting_of
 from der_planner.results.errors import (
-    EvaluationSettings,
     Split,
     check_board,
     check_tracker,
@@ -82,7 +81,6 @@ class RunResult(Split):
     payload_kg: float = 0.0
     payload_at_m: float = 0.0
     pressure_rms_error_pa: tuple[float, ...] = ()
-    removed_lag_s: float = 0.0
     problems: tuple[str, ...] = ()
     reference_points_m: tuple[tuple[float, float], ...] = ()
     checks: Mapping[str, float] = field(default_factory=dict)
@@ -106,32 +104,20 @@ def json_value(value: Any) -> Any:
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
-def evaluate_bag(path: str | Path, settings: EvaluationSettings | None = None) -> RunResult:
-    """Evaluate one bag; see `evaluate_run`.
-
-    Raises:
-        EvaluationError: it holds no plan or no limb states.
-        BagError: it cannot be read.
-    """
-    return evaluate_run(load_run(path), settings)
-
-
-def evaluate_run(run: RunSeries, settings: EvaluationSettings | None = None) -> RunResult:
+def evaluate_run(run: RunSeries) -> RunResult:
     """Compute every figure of a run.
 
     Args:
         run: from `load_run` or `RunSeries.from_arrays`.
-        settings: window and lag.
 
     Raises:
         EvaluationError: there is no valid image in the window.
     """
-    settings = settings or EvaluationSettings()
-    series = error_series(run, settings)
-    first, last = window(run, settings)
+    series = error_series(run)
+    first, last = window(run)
     images = run.tip.between(first, last).time
     dropped, longest = _gaps(images, series.time, first, last)
-    split = split_error(run, settings)
+    split = split_error(run)
     about = run.description
     valid = len(series.time) / max(1, len(images))
     return RunResult(
@@ -163,7 +149,6 @@ def evaluate_run(run: RunSeries, settings: EvaluationSettings | None = None) -> 
         payload_at_m=about.payload_at,
         **dataclasses.asdict(split),
         pressure_rms_error_pa=_pressure_errors(run, first, last),
-        removed_lag_s=split.lag_s if settings.remove_lag else 0.0,
         problems=_problems(run, valid, longest),
         reference_points_m=_reference_points(run, first, last),
         checks=check_tracker(run.tip, run.truth, first, last) | check_board(run.board),
@@ -229,14 +214,11 @@ class Evaluated:
     error: str = ""
 
 
-def evaluate_bags(
-    paths: Sequence[Path], settings: EvaluationSettings | None = None
-) -> Iterator[Evaluated]:
+def evaluate_bags(paths: Sequence[Path]) -> Iterator[Evaluated]:
     """Evaluate bags one after the other; one that fails does not stop the others.
 
     Args:
         paths: bag folders or files.
-        settings: for all of them.
 
     Yields:
         One entry per limb that has a plan, in the order of the paths; one with the reason for a
@@ -251,6 +233,6 @@ def evaluate_bags(
         for namespace in sorted(record.played or record.limbs) or [""]:
             try:
                 run = run_of(record, namespace)
-                yield Evaluated(path, run, evaluate_run(run, settings))
+                yield Evaluated(path, run, evaluate_run(run))
             except (BagError, EvaluationError, OSError) as error:
                 yield Evaluated(path, error=str(error))

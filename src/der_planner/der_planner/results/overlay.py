@@ -19,7 +19,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from der_planner.arrays import Array
+from der_planner.arrays import Array, points_of
 from der_planner.bags.reader import BagReader
 from der_planner.bags.record import (
     NANOSECONDS,
@@ -159,8 +159,8 @@ class RunImages:
         limb = self._nearest(MARKERS_TYPE, time)
         return Snapshot(
             None if image is None else gray(image),
-            _NOTHING if state is None or not state.valid else _points(state.curve),
-            _NOTHING if limb is None else _points(limb.points),
+            _NOTHING if state is None or not state.valid else points_of(state.curve),
+            _NOTHING if limb is None else points_of(limb.points),
         )
 
     def _nearest(self, kind: str, time: float) -> Any:
@@ -179,12 +179,12 @@ class RunImages:
         Pictures of an encoding that is not known are left out.
         """
         curves = {
-            header_stamp(message): _points(message.curve)
+            header_stamp(message): points_of(message.curve)
             for _, _, message in self._bag.messages(self._topics[STATE_TYPE])
             if message.valid
         }
         limbs = {
-            header_stamp(marker): _points(marker.points)
+            header_stamp(marker): points_of(marker.points)
             for _, _, message in self._bag.messages(self._topics[MARKERS_TYPE])
             for marker in message.markers
             if marker.ns == LIMB_MARKER
@@ -219,11 +219,6 @@ def _topics_of(bag: BagReader, type_name: str, namespace: str) -> list[str]:
 
     own = [name for name in named if lies_in(name, namespace)]
     return own or [name for name in named if not any(lies_in(name, limb) for limb in limbs)]
-
-
-def _points(points: Sequence[Any]) -> Array:
-    """Return messages' points as (N, 2)."""
-    return np.array([[point.x, point.y] for point in points]).reshape(-1, 2)
 
 
 def gray(image: Any) -> Picture | None:

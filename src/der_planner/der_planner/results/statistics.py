@@ -169,8 +169,6 @@ def why_not_comparable(results: Sequence[RunResult]) -> str:
         if len(values) > 1:
             listed = ", ".join(f"{value:g}{unit}" for value in values)
             return f"different {name.split('_')[0]}: {listed}"
-    if len({bool(run.removed_lag_s) for run in results}) > 1:
-        return "the lag was removed from some runs only"
     windows = {(round(run.window_s[0], 3), round(run.window_s[1], 3)) for run in results}
     if len(windows) > 1:
         return f"different windows: {', '.join(f'{a:g} to {b:g} s' for a, b in sorted(windows))}"

@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from der_planner.arrays import Array
+from der_planner.files import read_yaml
 from der_planner.limb import Limb, LimbError
 from der_planner.studies.factors import Factor, StudyError, Value, factor
 from der_planner.studies.tasks import TASKS, Task
@@ -176,15 +176,9 @@ class Study:
             StudyError: the file is missing or something in it is wrong; names file and key.
         """
         path = find(given)
+        content = read_yaml(path, "study", StudyError)
         try:
-            text = path.read_text(encoding="utf-8")
-            content = yaml.safe_load(text)
-        except (OSError, UnicodeDecodeError) as error:
-            raise StudyError(f"cannot read study {path}: {error}") from error
-        except yaml.YAMLError as error:
-            raise StudyError(f"study {path} is not valid YAML: {error}") from error
-        try:
-            return _parse(content, path, text)
+            return _parse(content, path, path.read_text(encoding="utf-8"))
         except StudyError as error:
             raise StudyError(f"study {path}: {error}") from error
 

@@ -26,8 +26,8 @@ from der_planner.arrays import Array
 from der_planner.control import Feedback, Learner, lockstep
 from der_planner.identification import FitReport, calibrate_twin, predict, record_twin
 from der_planner.identification.excitation import TIP_NOISE, Excitation
-from der_planner.limb import Limb, Pneumatics, declarations
-from der_planner.model import simulate
+from der_planner.limb import Limb, Load, Pneumatics, declarations
+from der_planner.model import CONTROL_PERIOD, simulate
 from der_planner.planning import Motion, Plan, plan
 from der_planner.studies.factors import (
     ERROR,
@@ -38,14 +38,12 @@ from der_planner.studies.factors import (
     split_error,
     with_defaults,
 )
-from der_planner.twin import offline
 from der_planner.twin.hardware import draw, known_values
+from der_planner.twin.offline import LEAD, OfflineTwin
 from pressure_driver.emulator import pneumatics
 
 Values = Mapping[str, Value]
 Result = dict[str, float]
-_VENTED = 1.0
-"""Before a run the twin rests for so long [s], with feedback and without."""
 _FIRST_LEARNING_RUN = 10
 """Runs of a twin's hardware from here on are learned from; the one that counts is run 0."""
 _UNSEEN_RUN = 2
@@ -188,8 +186,7 @@ def _errors(planned: Plan, tip: Array) -> Result:
 
 def _loaded(limb: Limb, row: Mapping[str, Any]) -> Limb:
     """Return a limb as a row mounts it, with the row's payload."""
-    at = row["payload_at"]
-    return limb.mounted(row["mounting"]).carrying(row["payload"], at if at > 0 else None)
+    return limb.loaded(Load(row["payload"], row["payload_at"], row["mounting"]))
 
 
 def _planned(limb: Limb, row: Mapping[str, Any]) -> Plan:
@@ -206,7 +203,7 @@ def _run(limb: str, row: Mapping[str, Any]) -> Result:
     loads = _loaded(limb_of(limb), row)
     if row["learning_runs"]:
         planned = _learned(planned, loads, row)
-    tip, held = (_with_feedback if row["feedback"] == "on" else _blind)(planned, loads, row)
+    tip, held = _played(planned, loads, row, feedback=row["feedback"] == "on")
     return {
         **_errors(planned, tip),
         "pressure_rms_error_pa": float(np.sqrt(np.mean(held**2))),
@@ -218,7 +215,7 @@ def _learned(planned: Plan, loads: Limb, row: Mapping[str, Any]) -> Plan:
     """Return the plan after runs of it on the same hardware, as a camera would have seen them."""
     learner = Learner(planned)
     for run in range(_FIRST_LEARNING_RUN, _FIRST_LEARNING_RUN + row["learning_runs"]):
-        tip, beyond = _blind(planned, loads, row, run)
+        tip, beyond = _played(planned, loads, row, run)
         held = planned.time, planned.differential_pressure + beyond
         noise = np.random.default_rng([row["seed"], run]).standard_normal(tip.shape)
         learner.add(planned.time, tip + row["tag_noise"] * TIP_NOISE * noise, chambers=held)
@@ -228,33 +225,25 @@ def _learned(planned: Plan, loads: Limb, row: Mapping[str, Any]) -> Plan:
     return planned
 
 
-def _blind(planned: Plan, loads: Limb, row: Mapping[str, Any], run: int = 0) -> tuple[Array, Array]:
+def _played(
+    planned: Plan, loads: Limb, row: Mapping[str, Any], run: int = 0, feedback: bool = False
+) -> tuple[Array, Array]:
     """Return the twin's tips (K, 2) [m] and chamber less commanded pressures (K, M) [Pa]."""
-    played = offline.play(
-        planned.time,
-        planned.differential_pressure,
-        seed=row["seed"],
-        run=run,
-        gravity=loads.gravity,
-        masses=loads.masses,
-    )
-    return played.tip, played.measured_differential - played.commanded_differential
-
-
-def _with_feedback(planned: Plan, loads: Limb, row: Mapping[str, Any]) -> tuple[Array, Array]:
-    """Return the same of a run whose commands are revised by what camera and board tell."""
-    usual, noise = lockstep.Sensors(), row["tag_noise"]
+    usual, noise, seed = lockstep.Sensors(), row["tag_noise"], row["seed"]
     sensors = replace(
         usual,
+        # Without feedback nobody looks at pictures: none is taken between two commands.
+        frame_rate=usual.frame_rate if feedback else 1.0 / CONTROL_PERIOD,
         latency=row["latency"],
         bend_noise=noise * usual.bend_noise,
         tip_noise=noise * usual.tip_noise,
         pressure_noise=noise * usual.pressure_noise,
-        seed=row["seed"],
+        seed=seed,
     )
-    plant = offline.OfflineTwin(row["seed"], gravity=loads.gravity, masses=loads.masses)
-    plant.rest(_VENTED)
-    played = lockstep.play(planned, plant, Feedback(planned), sensors)
+    count = loads.segment_count
+    plant = OfflineTwin(seed, run, segment_count=count, gravity=loads.gravity, masses=loads.masses)
+    plant.rest(LEAD)
+    played = lockstep.play(planned, plant, Feedback(planned) if feedback else None, sensors)
     return played.tip, played.differential_pressure - played.commanded
 
 

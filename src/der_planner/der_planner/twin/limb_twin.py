@@ -182,12 +182,6 @@ class LimbTwin:
                 )
         self._pegs = Pegs(centre, np.ascontiguousarray(radius), np.zeros((len(centre), 3, 1)))
 
-    @property
-    def touch(self) -> Array:
-        """(2,) force of all pegs on the limb [N]."""
-        force: Array = -self._pegs.force.sum(axis=0)[:2, 0]
-        return force
-
     def shape(self, points: int = 0) -> TwinShape:
         """Return the true centreline.
 
@@ -324,8 +318,6 @@ class RealTimeLoop:
         clock: steady clock that measures the cost of a call [s].
 
     Attributes:
-        capacity: simulated time per time spent in `advance`, smoothed; the margin over real time.
-        busy: share of one core spent in `advance` and `publish`, smoothed.
         lag: how late the last tick was [s].
         simulated_until: steady time up to which was simulated [s].
         dropped: time that was never simulated [s].
@@ -346,9 +338,8 @@ class RealTimeLoop:
         self._begin = self.simulated_until = 0.0
         self._next_publish = 0.0
         self._started = False
-        self._spent = self._covered = 0.0
         self._last_drop = -1e9
-        self.capacity = self.busy = self.lag = self.dropped = 0.0
+        self.lag = self.dropped = 0.0
         self.behind = False
 
     @property
@@ -374,21 +365,9 @@ class RealTimeLoop:
         if passed > 0:
             self._advance(passed)
             self.simulated_until = now
-        spent = self._clock() - begin
         if now >= self._next_publish:
             self._publish(self._clock() - begin)
             while self._next_publish <= now:
                 self._next_publish += self._period
-        self._account(passed, spent, self._clock() - begin)
         wake = min(now + self._period / TICKS_PER_PERIOD, self._next_publish)
         return max(0.0, wake - now - (self._clock() - begin))
-
-    def _account(self, passed: float, stepping: float, total: float) -> None:
-        fade = 0.98
-        self._covered = fade * self._covered + passed
-        self._spent = fade * self._spent + stepping
-        if self._spent > 0:
-            self.capacity = self._covered / self._spent
-        if self._covered > 0:
-            share = total / max(passed, 1e-9)
-            self.busy = fade * self.busy + (1 - fade) * share

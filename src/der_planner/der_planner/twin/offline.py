@@ -17,6 +17,8 @@ from pressure_driver.emulator.pneumatics import BoardPneumatics
 
 FINE_STEP = 0.01
 """Chamber pressures are held on the limb for this long [s], half the board's telemetry period."""
+LEAD = 1.0
+"""Vented time before the first setpoint [s]."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +115,6 @@ def play(
     seed: int = 0,
     *,
     run: int = 0,
-    lead: float = 1.0,
     gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
     masses: Iterable[PointMass] = (),
     pushes: Iterable[Push] = (),
@@ -128,7 +129,6 @@ def play(
         differential_pressure: (K, M) [Pa].
         seed: draws limb and pneumatics.
         run: draws the wandering rest angles of this run of the same hardware.
-        lead: vented time before the first setpoint [s].
         gravity: (3,) acceleration in `limb_base` [m/s²].
         masses: what the limb carries from the start beside its own mass.
         pushes: what pushes or loads it on the way; their instants are on the axis of ``time``.
@@ -142,8 +142,8 @@ def play(
     tip = np.empty((instants.size, 2))
     angles, chambers = np.empty_like(wanted), np.empty((instants.size, 2 * wanted.shape[1]))
     for push in pushes:
-        limb.twin.push(replace(push, instant=push.instant - instants[0] + lead))
-    limb.rest(lead)
+        limb.twin.push(replace(push, instant=push.instant - instants[0] + LEAD))
+    limb.rest(LEAD)
     for k, setpoint in enumerate(wanted):
         tip[k], angles[k], chambers[k] = limb.tip, limb.bend_angles, limb.pneumatics.pressure
         limb.command(setpoint)
