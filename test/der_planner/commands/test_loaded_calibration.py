@@ -70,7 +70,7 @@ def test_what_a_scale_shows_sets_the_scale_of_the_limb_file(table, monkeypatch, 
     assert "as in the prior: it was not weighed (--mass KG)" in said
     prior, limb = found
     assert f"the limb weighs {1000 * limb.mass:.0f} g in its file, by --mass" in said
-    assert limb.mass == pytest.approx(heavier, rel=0.011)
+    assert limb.mass == pytest.approx(heavier, rel=1e-9)
     assert limb.provenance["weighed_kg"] == pytest.approx(heavier)
     # The payload on both is the same 50 g: what the scale changes is a little less than 15 %.
     for before, after in zip(prior.segments, limb.segments, strict=True):

@@ -50,7 +50,6 @@ from der_planner.experiment.processes import GraphError, Hardware, NodeError
 from der_planner.files import write_whole
 from der_planner.identification import (
     CalibrationLog,
-    FitReport,
     LogError,
     fit,
     predict,
@@ -79,8 +78,6 @@ from pressure_driver.settings import Settings
 
 LAST_PART = 0.25
 """Share of a LOG that is kept back to judge the fit."""
-SAME_MASS = 0.01
-"""Share by which the fitted lengths may change the mass of a limb that was weighed."""
 
 
 def main() -> int:
@@ -120,7 +117,12 @@ def _main(given: argparse.Namespace) -> int:
     if given.log is not None and not given.held_out and given.weight is None:
         log, rest = log.parted(LAST_PART)
         kept_back = [dataclasses.replace(rest, source=f"the end of {rest.source}, not shown")]
-    limb, report = _fit(prior, log, load, given)
+    terms = [*given.terms, *(["mass"] if given.fit_mass else [])]
+    weight = None if given.weight is None else (given.weight, given.at)
+    limb, report = fit(prior, log, terms=terms, longest_gap=given.longest_gap, weight=weight)
+    if given.mass is not None:
+        provenance = {**limb.provenance, "weighed_kg": given.mass}
+        limb = dataclasses.replace(limb, provenance=provenance)
     unseen = [*kept_back, *held_out]
     kept = _unloaded(limb, load)
     lines = [report.text(), *(_held_out_text(limb, each, given.longest_gap) for each in unseen)]
@@ -272,34 +274,6 @@ def _check(given: argparse.Namespace) -> None:
 def _unloaded(limb: Limb, load: Load) -> Limb:
     """Return a limb without the payload of a load, which was put on last."""
     return dataclasses.replace(limb, masses=limb.masses[:-1]) if load.payload else limb
-
-
-def _fit(
-    prior: Limb, log: CalibrationLog, load: Load, given: argparse.Namespace
-) -> tuple[Limb, FitReport]:
-    """Fit; a limb that was weighed weighs the same with the lengths that were found."""
-    terms = [*given.terms, *(["mass"] if given.fit_mass else [])]
-    weight = None if given.weight is None else (given.weight, given.at)
-    limb, report = fit(prior, log, terms=terms, longest_gap=given.longest_gap, weight=weight)
-    if given.mass is None:
-        return limb, report
-    found = _unloaded(limb, load)
-    off = found.mass / given.mass - 1.0
-    if abs(off) > SAME_MASS:
-        print(
-            f"the lengths that were found make the limb {100 * off:+.1f} % of what it weighs: "
-            "fitting once more …",
-            file=sys.stderr,
-        )
-        weighed = found.weighing(given.mass).segments
-        segments = tuple(
-            dataclasses.replace(old, mass_per_length=new.mass_per_length)
-            for old, new in zip(prior.segments, weighed, strict=True)
-        )
-        again = dataclasses.replace(prior, segments=segments, pcc_segments=())
-        limb, report = fit(again, log, terms=terms, longest_gap=given.longest_gap, weight=weight)
-    provenance = {**limb.provenance, "weighed_kg": given.mass}
-    return dataclasses.replace(limb, provenance=provenance), report
 
 
 def _weight(limb: Limb, given: argparse.Namespace) -> str:

@@ -119,10 +119,11 @@ class Measured:
             raise LearningError(
                 f"the tips are {far:.3g} m from the clamp of a limb of {length:.3g} m: give metres"
             )
-        span = float(self.time[-1] - self.time[0])
-        if span > _LONGEST * duration:
+        first, last = float(self.time[0]), float(self.time[-1])
+        if max(-first, last) > _LONGEST * duration:
             raise LearningError(
-                f"the run takes {span:.3g} s, its plan {duration:.3g} s: give seconds"
+                f"the run goes from {first:.6g} to {last:.6g} s, its plan takes {duration:.3g} s: "
+                "give seconds since the plan's first setpoint"
             )
 
 

@@ -250,7 +250,7 @@ def lengths_of(limb: Limb) -> Array:
 def with_lengths(limb: Limb, lengths: Array) -> Limb:
     """Return the limb with lengths (L,) [m] in the order of `lengths_of`.
 
-    What the limb carries stays where it is on its segment or connector.
+    It weighs the same, and what it carries stays where it is on its segment or connector.
     """
     segments = tuple(
         replace(segment, length=float(length))
@@ -264,7 +264,7 @@ def with_lengths(limb: Limb, lengths: Array) -> Limb:
         replace(item, arc_length=float(place))
         for item, place in zip(limb.masses, places, strict=True)
     )
-    return replace(bare, masses=tuple(masses))
+    return replace(bare, masses=tuple(masses)).weighing(limb.mass)
 
 
 def _even_tip(limb: Limb, angles: Array) -> Array:

@@ -63,6 +63,9 @@ class CalibrationLog:
     source: str = ""
 
     def __post_init__(self) -> None:
+        tables = ("commanded_differential", "measured_differential", "bend_angles", "tip")
+        for name in ("time", *tables):
+            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=float))
         rows = self.time.shape
         if self.time.ndim != 1 or self.time.size < 2:
             raise LogError(f"a log needs two instants or more, time has shape {rows}")
@@ -73,9 +76,9 @@ class CalibrationLog:
                 f"the time of {self.source or 'a log'} falls from {before:.6g} s to {after:.6g} s: "
                 "is it more than one run, or has a clock been set? Keep one run a table"
             )
-        inputs, points = (len(self.time), self.bend_angles.shape[-1]), (len(self.time), 2)
-        for name in ("commanded_differential", "measured_differential", "bend_angles", "tip"):
-            found, expected = getattr(self, name).shape, points if name == "tip" else inputs
+        inputs = self.commanded_differential.shape[-1:]
+        for name in tables:
+            found, expected = getattr(self, name).shape, rows + (inputs if name != "tip" else (2,))
             if found != expected:
                 raise LogError(f"{name} has shape {found}, expected {expected}")
 

@@ -154,7 +154,7 @@ class Motion:
                 f"amplitude is {amplitude:.4g} rad ({math.degrees(amplitude):.0f} degrees): "
                 "a segment bends by 3.14 rad at most; is it in radians?"
             )
-        if cycles != int(cycles) or cycles < 1:
+        if not (math.isfinite(cycles) and cycles == int(cycles) and cycles >= 1):
             raise PlanningError(f"cycles must be a whole number of 1 or more, got {cycles}")
         if period < 4 * CONTROL_PERIOD:
             raise PlanningError(f"period is {period} s: the shortest is {4 * CONTROL_PERIOD} s")
