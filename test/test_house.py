@@ -21,7 +21,8 @@ Kind = TypeVar("Kind", bound=ast.AST)
 @functools.cache
 def nodes() -> list[tuple[Path, ast.AST]]:
     """Return all of the sources and scripts as their parser sees them, with the files."""
-    paths = [path for folder in ("src", "scripts") for path in (ROOT / folder).rglob("*.py")]
+    every = (path for folder in ("src", "scripts") for path in (ROOT / folder).rglob("*.py"))
+    paths = [path for path in every if "build" not in path.parts]  # pip leaves a copy there
     return [
         (path.relative_to(ROOT), node)
         for path in sorted(paths)

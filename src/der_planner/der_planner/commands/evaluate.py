@@ -102,6 +102,7 @@ def _evaluate(given: argparse.Namespace) -> int:
     if given.report is not None:
         print(write_report(runs, results, given.report, progress=progress.say))
     if given.video is not None:
+        given.video.parent.mkdir(parents=True, exist_ok=True)
         print(write_video(runs[0], given.video))
     for run in runs if given.contact else ():
         print("\n".join([f"{run.description.title}:", *_touched(run, given)]))
