@@ -168,7 +168,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--columns", type=Path, metavar="FILE", help="YAML map of tables' columns")
     parser.add_argument("--namespace", default="", help="of the limb, where a bag holds several")
     parser.add_argument("--prior", type=Path, help="limb file to start from (default: built in)")
-    parser.add_argument("--seed", type=int, default=0, help="of the twin (default: 0)")
+    parser.add_argument("--seed", type=int, default=1, help="of the twin (default: 1)")
     parser.add_argument("--quick", action="store_true", help="90 s instead of 200 s of excitation")
     parser.add_argument(
         "--terms",

@@ -69,7 +69,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--pressure", type=float, default=GENTLE, help=f"of the fills [Pa] (default: {GENTLE:.0f})"
     )
-    parser.add_argument("--seed", type=int, default=0, help="of the twin (default: 0)")
+    parser.add_argument("--seed", type=int, default=1, help="of the twin (default: 1)")
     parser.add_argument(
         "--wiring",
         type=int,
