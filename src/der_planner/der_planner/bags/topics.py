@@ -169,7 +169,7 @@ class TopicSpec:
 
     @property
     def latched(self) -> bool:
-        """Whether the topic's last message is repeated at the start of every file of a bag.
+        """Whether the last message before a recording begins goes into the bag, too.
 
         ``/rosout`` is published so, too, but an old log line is no state that anyone waits for.
         """
