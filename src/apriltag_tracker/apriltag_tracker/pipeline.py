@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from apriltag_tracker.camera import CameraPose, Intrinsics
+from apriltag_tracker.camera import CameraError, CameraPose, Intrinsics
 from apriltag_tracker.detection import Detector, Tag
 from apriltag_tracker.detection.tracking import FULL_SEARCH_PERIOD, TagTracker
 from apriltag_tracker.pose.following import LimbFollower, survey_errors
@@ -104,11 +104,11 @@ class LimbTracker:
             search_later: leave what cannot change the answer to `search_again`.
 
         Raises:
-            ValueError: the image is none, or has another size than the calibration.
+            CameraError: the image has another size than the calibration.
         """
         size = self.intrinsics
         if gray.shape[:2] != (size.height, size.width):
-            raise ValueError(
+            raise CameraError(
                 f"the image has {gray.shape[1]} x {gray.shape[0]} px but the calibration is for "
                 f"{size.width} x {size.height}: calibrate at the resolution that is used"
             )
