@@ -136,11 +136,8 @@ class LimbTracker:
             self.intrinsics,
             pose,
         )
-        used = [
-            i
-            for i, tag in enumerate(found)
-            if tag.id in self._limb_tags and misfits[i] <= self.options.largest_misfit * flat[i, 1]
-        ]
+        limb = [i for i, tag in enumerate(found) if tag.id in self._limb_tags]
+        used = [i for i in limb if misfits[i] <= self.options.largest_misfit * flat[i, 1]]
         planar = []
         for i in used:
             entry = self._limb_tags[found[i].id]
@@ -152,7 +149,8 @@ class LimbTracker:
             for tag, place in zip(found, places, strict=True)
         )
         root = np.linalg.cholesky(self.world.covariance + 1e-18 * np.eye(6))
-        followed = self.follower.follow(planar, stamp, common, moves[used] @ root)
+        unfit = len(limb) - len(used)
+        followed = self.follower.follow(planar, stamp, common, moves[used] @ root, unfit)
         return LimbObservation(placed, *followed)
 
     def _common_errors(
