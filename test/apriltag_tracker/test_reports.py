@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import dataclasses
+import re
+
 import numpy as np
 import pytest
 from waiting import Clock
@@ -61,6 +64,21 @@ def test_a_stream_that_stops_is_an_error(clock, tracker, camera, swing):
     assert values["processing_ms_p99"] == "2.00"
     clock.now += 3.0
     assert watch.report(tracker, 1)[0] == "error"
+
+
+@pytest.mark.parametrize("height", [0.0, 0.06])
+def test_limb_tags_that_all_look_too_large_or_small_are_a_warning(
+    clock, tags, model, camera, swing, height
+):
+    limb = tuple(dataclasses.replace(tag, height=height) for tag in tags.limb)
+    tracker = LimbTracker(dataclasses.replace(tags, limb=limb), model.intrinsics)
+    watch, image = ImageWatch("topic", True, clock), camera.frame(swing.shape(0.0)).image
+    for k in range(40):
+        watch.arrived(k)
+        watch.observed(tracker.observe(image, k / 30.0), 0.004, 0.002)
+    level, message = watch.report(tracker)
+    assert level == "warning"
+    assert re.search("look [45] % larger or smaller than the tag map says: check height", message)
 
 
 def test_problems_come_before_the_state(clock, tracker):

@@ -17,6 +17,10 @@ from apriltag_tracker.pose.world import WorldPose, locate
 from apriltag_tracker.tag_map import LimbTag, TagMap, WorldTag
 
 
+_SIZE_MEMORY = 20
+"""Pictures over which the size of the limb's tags is averaged."""
+
+
 @dataclass(frozen=True)
 class TrackerOptions(FollowerOptions):
     """How the tracker works.
@@ -92,6 +96,8 @@ class LimbTracker:
         self.tracker = TagTracker(self._flat, detector, self.options.full_search_period)
         self.world = WorldPose(tags, intrinsics)
         self.follower = LimbFollower(tags, self.options)
+        self.size_error = 0.0
+        """Share by which limb tags look larger or smaller than the tag map says, all alike."""
 
     def observe(
         self, gray: NDArray[np.uint8], stamp: float, search_later: bool = False
@@ -137,6 +143,10 @@ class LimbTracker:
             pose,
         )
         limb = [i for i, tag in enumerate(found) if tag.id in self._limb_tags]
+        if limb:
+            # Of a square that is larger or smaller by a share, corners are off by half its diagonal.
+            share = np.sqrt(2.0) * float(np.median(misfits[limb] / flat[limb, 1]))
+            self.size_error += (share - self.size_error) / _SIZE_MEMORY
         used = [i for i in limb if misfits[i] <= self.options.largest_misfit * flat[i, 1]]
         planar = []
         for i in used:

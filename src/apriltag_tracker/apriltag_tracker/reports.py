@@ -18,6 +18,8 @@ NO_CALIBRATION = (
     "(scripts/calibrate_camera.py writes one)"
 )
 
+_SIZE_ERROR = 0.03
+"""Tags of 14 px look larger or smaller by a third of this from noise."""
 _TAG = (60, 200, 60)
 _WORLD = (220, 160, 40)
 _CURVE = (40, 120, 255)
@@ -87,6 +89,9 @@ class ImageWatch(StreamWatch):
         if world.excluded:
             named = ", ".join(f"{tag} ({gap:.1f} px)" for tag, gap in world.excluded.items())
             return "warning", f"fixed tags that do not fit the others: {named}"
+        if tracker.size_error > _SIZE_ERROR:
+            off = f"the limb's tags look {100 * tracker.size_error:.0f} % larger or smaller"
+            return "warning", f"{off} than the tag map says: check height and size"
         if world.bumps:
             return (
                 "warning",
