@@ -57,7 +57,6 @@ class TrackerNode(LimbStateNode):
         warm_up(self._detector)
         self._tracker: LimbTracker | None = None
         self._reader = ImageReader()
-        self._last_stamp = -1
         self._frame = ""
         self._level = ""
         self._image_topic = self.resolve_topic_name(topics.IMAGE)
@@ -167,13 +166,11 @@ class TrackerNode(LimbStateNode):
     def _process(self, gray: NDArray[np.uint8], stamp: Time) -> None:
         """Process one image and publish what it says under its own stamp."""
         started = time.perf_counter()
-        self._watch.arrived(stamps.nanoseconds(stamp))
-        if stamps.nanoseconds(stamp) == self._last_stamp:
+        taken = stamps.nanoseconds(stamp)
+        if not self._watch.arrived(taken):
             # The same picture again says nothing new.
-            self._watch.repeated += 1
             return
-        self._last_stamp = stamps.nanoseconds(stamp)
-        stamp = stamps.stamp_from_nanoseconds(self._last_stamp - self.sensor_delay)
+        stamp = stamps.stamp_from_nanoseconds(taken - self.sensor_delay)
         if self._tracker is None:
             self._fail(stamp, self._watch.calibration_problem or NO_CALIBRATION)
             return
