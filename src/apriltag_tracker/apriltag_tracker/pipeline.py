@@ -16,7 +16,6 @@ from apriltag_tracker.pose.shape import FollowerOptions, LimbEstimate, PlanarTag
 from apriltag_tracker.pose.world import WorldPose, locate
 from apriltag_tracker.tag_map import LimbTag, TagMap, WorldTag
 
-
 _SIZE_MEMORY = 20
 """Pictures over which the size of the limb's tags is averaged."""
 
@@ -144,7 +143,7 @@ class LimbTracker:
         )
         limb = [i for i, tag in enumerate(found) if tag.id in self._limb_tags]
         if limb:
-            # Of a square that is larger or smaller by a share, corners are off by half its diagonal.
+            # Corners of a square that is too large are off by this share of half its diagonal.
             share = np.sqrt(2.0) * float(np.median(misfits[limb] / flat[limb, 1]))
             self.size_error += (share - self.size_error) / _SIZE_MEMORY
         used = [i for i in limb if misfits[i] <= self.options.largest_misfit * flat[i, 1]]

@@ -162,6 +162,12 @@ def stamps_of(assembler, *come):
     return told
 
 
+def every_10_ms(assembler, count, **late):
+    """Take all bodies so often, late by some ms; return the stamps of the frames."""
+    come = [f"{name} {10 * k + after}" for k in range(count) for name, after in late.items()]
+    return [stamp for frames in stamps_of(assembler, *come) for stamp in frames]
+
+
 def test_poses_that_come_one_by_one_become_frames(assembler):
     assert stamps_of(assembler, "a 0", "b 0") == [[], []]
     (frame,) = assembler.take("c", 400_000, pose(3.0))
@@ -185,6 +191,19 @@ def test_a_body_that_is_lost_holds_up_frames_and_comes_back(assembler):
     assert told == [[], [], [], [], [20], [30, 40], [], [50]]
     told = stamps_of(assembler, "c 50", "a 60", "b 60", "c 60")
     assert told == [[], [], [], [60]]
+
+
+def test_bodies_may_be_stamped_one_by_one(assembler):
+    assert every_10_ms(assembler, 4, a=0, b=2, c=4.5) == [0, 10, 20, 30]
+    # The second is late, the first comes early.
+    assert stamps_of(assembler, "c 44", "a 41", "b 43.5")[-1] == [44]
+
+
+def test_a_body_of_another_clock_is_left_out_by_name(assembler):
+    told = every_10_ms(assembler, 20, a=0, b=3000, c=0)
+    assert told == [10 * k for k in range(len(told))]
+    assert len(told) >= 18
+    assert assembler.astray == pytest.approx({"b": 3.0}, abs=0.01)
 
 
 def test_a_clock_that_was_set_back_begins_anew(assembler):

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import bisect
 import math
+from collections import deque
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
@@ -33,8 +34,10 @@ _LEAST_SPREAD = 0.005
 _LEAST_MOTION = 0.003
 """RMS way across its main direction that a limb must move to show its plane [m]."""
 
-_SAME_INSTANT = 1_000_000
-"""Stamps that are nearer than this belong to one frame [ns]."""
+_TOGETHER = 0.75
+"""Share of the usual time between frames within which poses are of one frame."""
+_INTERVAL = 50_000_000
+"""Usual time from one pose of a body to its next before it is known [ns]."""
 _OPEN_FRAMES = 2
 """A body that is missing is waited for until so many later frames have begun."""
 _FROZEN_FRAMES = 3
@@ -60,8 +63,10 @@ class PoseFrame(NamedTuple):
 class FrameAssembler:
     """Puts poses that come one body at a time together to frames.
 
-    A frame is complete when all bodies have come that came lately. Messages of one body keep their
-    order, those of different bodies may not: a few frames are open at a time.
+    Poses belong together whose stamps differ by less than the usual time between two poses of a
+    body, which may be stamped one by one. A frame is complete when all bodies have come that came
+    lately. Messages of one body keep their order, those of different bodies may not: a few frames
+    are open at a time.
 
     Args:
         bodies: the body map.
@@ -69,11 +74,17 @@ class FrameAssembler:
 
     def __init__(self, bodies: BodyMap) -> None:
         self._places = {name: place for place, name in enumerate(bodies.names)}
-        self._open: list[tuple[PoseFrame, set[int]]] = []
-        self._closed: int | None = None
+        self._frames: list[tuple[PoseFrame, set[int]]] = []
+        """The last one that was told, if any, and those that are open."""
+        self._told = 0
         self._expected = set(self._places.values())
+        self._last: dict[str, int] = {}
+        self._came: deque[int] = deque(maxlen=len(self._places))
+        self._intervals = deque([_INTERVAL], maxlen=50)
         self.unknown: dict[str, int] = {}
         """Poses of bodies that are not in the map, by name."""
+        self.astray: dict[str, float] = {}
+        """Bodies whose stamps are of another clock than the others', by how much [s]."""
 
     def take(self, name: str, stamp: int, pose: tuple[float, ...]) -> list[PoseFrame]:
         """Take x, y, z and the quaternion x, y, z, w of a body; return the frames that end so."""
@@ -81,32 +92,65 @@ class FrameAssembler:
         if place is None:
             self.unknown[name] = self.unknown.get(name, 0) + 1
             return []
-        if self._closed is not None and stamp <= self._closed + _SAME_INSTANT:
-            if stamp > self._closed - _CLOCK_SET:
-                # Of a frame that was told already: the next one waits for this body, too.
-                self._expected.add(place)
-                return []
-            self._open, self._closed = [], None
-        at = bisect.bisect(self._open, stamp - _SAME_INSTANT - 1, key=lambda each: each[0].stamp)
-        if at == len(self._open) or self._open[at][0].stamp > stamp + _SAME_INSTANT:
-            count = len(self._places)
-            frame = PoseFrame(stamp, np.full((count, 3), np.nan), np.full((count, 4), np.nan))
-            self._open.insert(at, (frame, set()))
-        frame, given = self._open[at]
+        if not self._is_of_this_clock(name, stamp):
+            return []
+        if self._told and stamp < self._frames[0][0].stamp - _CLOCK_SET:
+            self._frames, self._told = [], 0
+        at = self._find(place, stamp)
+        if at < self._told:
+            # Of a frame that was told already: the next one waits for this body, too.
+            self._expected.add(place)
+            return []
+        frame, given = self._frames[at]
         frame.positions[place], frame.quaternions[place] = pose[:3], pose[3:]
         given.add(place)
         if given >= self._expected:
             # The bodies that an older one lacks have come with this one.
-            return self._close(at + 1)
-        if len(self._open) > _OPEN_FRAMES:
-            self._expected = set(self._open[0][1])
-            return self._close(1)
+            return self._tell(at + 1)
+        if len(self._frames) - self._told > _OPEN_FRAMES:
+            self._expected = set(self._frames[self._told][1])
+            return self._tell(self._told + 1)
         return []
 
-    def _close(self, count: int) -> list[PoseFrame]:
-        frames = [frame for frame, _ in self._open[:count]]
-        self._open, self._closed = self._open[count:], frames[-1].stamp
-        return frames
+    def _is_of_this_clock(self, name: str, stamp: int) -> bool:
+        """Tell whether a stamp is new and near those of the other bodies."""
+        interval = stamp - self._last.get(name, stamp - _INTERVAL)
+        self._last[name] = stamp
+        if interval < -_CLOCK_SET:
+            self._came.clear()
+        self._came.append(stamp)
+        if 0 < interval < _CLOCK_SET:
+            self._intervals.append(interval)
+        apart = stamp - _median(self._came)
+        self.astray.pop(name, None)
+        if abs(apart) > (_OPEN_FRAMES + 0.5) * _median(self._intervals):
+            self.astray[name] = 1e-9 * apart
+        return name not in self.astray and interval != 0
+
+    def _find(self, place: int, stamp: int) -> int:
+        """Return which frame lacks a body that came, and is near enough; open one if none is."""
+        apart = {
+            at: abs(frame.stamp - stamp)
+            for at, (frame, given) in enumerate(self._frames)
+            if place not in given
+        }
+        at = min(apart, key=apart.__getitem__, default=-1)
+        if at < 0 or apart[at] > _TOGETHER * _median(self._intervals):
+            at = bisect.bisect_left(self._frames, stamp, key=lambda each: each[0].stamp)
+            if at >= self._told:
+                count = len(self._places)
+                frame = PoseFrame(stamp, np.full((count, 3), np.nan), np.full((count, 4), np.nan))
+                self._frames.insert(at, (frame, set()))
+        return at
+
+    def _tell(self, end: int) -> list[PoseFrame]:
+        ended = [frame for frame, _ in self._frames[self._told : end]]
+        self._frames, self._told = self._frames[end - 1 :], 1
+        return ended
+
+
+def _median(values: deque[int]) -> int:
+    return sorted(values)[len(values) // 2]
 
 
 def fit_frame(points: Array, places: Array) -> tuple[BaseFrame, float] | None:

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from apriltag_tracker.pose.shape import FollowerOptions, LimbEstimate, PlanarTag, ShapeFitter
 from apriltag_tracker.tag_map import LimbGeometry
 
-
 _STRETCH = 0.5
 """No soft limb is longer or shorter than at rest by more than this share."""
 
