@@ -91,6 +91,41 @@ def test_a_body_that_stands_still_while_others_move_is_lost(bodies, swing):
     assert "without body limb_4" in seen.followed.reason
 
 
+def test_poses_that_do_not_change_at_all_are_of_a_paused_source(bodies, swing):
+    frame, tracker = SyntheticMocap(bodies, NOISE).frame(0, swing.shape(0.0)), BodyTracker(bodies)
+    found = [tracker.observe(frame._replace(stamp=k * 10**7)).followed for k in range(6)]
+    assert [each.estimate is None for each in found] == [False] * 3 + [True] * 3
+    assert "is their source paused?" in found[-1].reason
+
+
+def test_mirrored_positions_of_flat_fixed_bodies_are_named(bodies, swing):
+    def flat(side):
+        places = [body.position * [1.0, side, 0.0] for body in bodies.fixed]
+        fixed = zip(bodies.fixed, places, strict=True)
+        return dataclasses.replace(
+            bodies, fixed=tuple(dataclasses.replace(b, position=p, rotation=None) for b, p in fixed)
+        )
+
+    _, _, found = run(SyntheticMocap(flat(1.0)), swing, 3, BodyTracker(flat(1.0)))
+    assert found[-1].followed.estimate is not None
+    _, _, found = run(SyntheticMocap(flat(1.0)), swing, 3, BodyTracker(flat(-1.0)))
+    assert found[-1].followed.estimate is None
+    assert "mirrored positions" in found[-1].followed.reason
+
+
+def test_what_no_body_can_be_is_not_seen(bodies, swing):
+    mocap, tracker = SyntheticMocap(bodies, NOISE), BodyTracker(bodies)
+    for k in range(300):
+        frame = mocap.frame(round(k * PERIOD * 1e9), swing.shape(k * PERIOD))
+        frame.positions[bodies.names.index("limb_1")] = 1e300
+        frame.positions[bodies.names.index("limb_2")] = 0.0
+        found = tracker.observe(frame._replace(quaternions=0.5 * frame.quaternions)).followed
+        assert found.reason == "without body limb_1, limb_2"
+    assert float(tracker.plane.values()["out_of_plane_mm_rms"]) < 0.2
+    empty = frame._replace(quaternions=np.zeros_like(frame.quaternions))
+    assert "a quaternion that is not zero" in BodyTracker(bodies).observe(empty).followed.reason
+
+
 @pytest.mark.parametrize("swapped", [("limb_2", "limb_4"), ("limb_4", "limb_5")])
 def test_bodies_with_each_others_names_tell_no_tip(bodies, swing, swapped):
     faults = dataclasses.replace(NOISE, swapped=swapped, swapped_from=0.5)

@@ -41,7 +41,13 @@ _INTERVAL = 50_000_000
 _OPEN_FRAMES = 2
 """A body that is missing is waited for until so many later frames have begun."""
 _FROZEN_FRAMES = 3
-"""A body whose pose has been the very same for so many frames while others moved is lost."""
+"""A body whose pose has been the very same for so many frames is lost."""
+_FARTHEST = 1e6
+"""No body is that far away [m], whatever its unit is taken for."""
+_UPSIDE_DOWN = (
+    "the limb's bodies are upside down: check for swapped names and mirrored positions of fixed "
+    "bodies, and the rotation of each body"
+)
 _CLOCK_SET = 1_000_000_000
 """Stamps that go back by more than this are of a clock that was set [ns]."""
 
@@ -191,7 +197,11 @@ class BaseFinder:
         self._given = self.frame = bodies.frame
         self.residual = math.nan
         """RMS distance of the fixed bodies from where the map has them [m]."""
-        self.problem = "" if bodies.frame else "no fixed body has been seen yet"
+        self.problem = (
+            ""
+            if bodies.frame
+            else "no fixed body has been seen yet, with a quaternion that is not zero"
+        )
 
     def update(self, positions: Array, rotations: Array) -> BaseFrame | None:
         """Take one frame of all bodies and return the base to use for it, None without one.
@@ -322,12 +332,19 @@ class BodyTracker:
         stamp = frame.stamp * 1e-9
         positions = self.bodies.unit * frame.positions
         norms = np.linalg.norm(frame.quaternions, axis=1)
-        lost = ~(np.isfinite(positions).all(axis=1) & (np.abs(norms - 1.0) < 0.1))
-        lost |= self._frozen(frame)
+        near = (np.abs(positions) < _FARTHEST).all(axis=1)
+        lost = ~(near & (norms > 0.0) & np.isfinite(norms))
+        # No pose of a limb is exactly zero: so some systems tell that they do not see a body.
+        lost[self._index] |= ~positions[self._index].any(axis=1)
+        frozen = self._frozen(frame)
+        places = np.full((len(self._index), 3), np.nan)
+        if frozen[~lost].all() and not lost[self._index].all():
+            paused = "the poses do not change at all: is their source paused?"
+            return BodyObservation(Followed(None, paused), places)
+        lost |= frozen
         quaternions = np.where(lost[:, None], [0.0, 0.0, 0.0, 1.0], frame.quaternions)
         rotations = Rotation.from_quat(quaternions).as_matrix()
         positions[lost], rotations[lost] = np.nan, np.nan
-        places = np.full((len(self._index), 3), np.nan)
         base = self.base.update(positions, rotations)
         if base is None:
             return BodyObservation(Followed(None, f"no base: {self.base.problem}"), places)
@@ -337,6 +354,8 @@ class BodyTracker:
         places[:, :2] = points[:, :2]
         places[:, 2] = np.arctan2(axes[:, 1, 0], axes[:, 0, 0])
         seen = np.flatnonzero(np.isfinite(places).all(axis=1)).tolist()
+        if seen and np.median(axes[seen, 2, 2]) < -0.5:
+            return BodyObservation(Followed(None, _UPSIDE_DOWN), places)
         planar = []
         for k in seen:
             body = self.bodies.limb[k]
@@ -346,9 +365,8 @@ class BodyTracker:
         return BodyObservation(followed, places)
 
     def _frozen(self, frame: PoseFrame) -> NDArray[np.bool_]:
-        """Return which bodies keep their pose to the last digit while others move, (n,)."""
+        """Return which bodies keep their pose to the last digit, (n,)."""
         now = np.hstack([frame.positions, frame.quaternions])
         self._same = np.where((now == self._before).all(axis=1), self._same + 1, 0)
         self._before = now
-        frozen = self._same >= _FROZEN_FRAMES
-        return frozen if not frozen[np.isfinite(now).all(axis=1)].all() else np.zeros_like(frozen)
+        return np.asarray(self._same >= _FROZEN_FRAMES)
