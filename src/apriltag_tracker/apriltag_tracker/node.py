@@ -16,6 +16,7 @@ from sensor_msgs.msg import CameraInfo, Image
 from apriltag_tracker.camera import CameraError, Intrinsics
 from apriltag_tracker.camera.images import ImageError, ImageReader, Source, open_source
 from apriltag_tracker.detection import Detector
+from apriltag_tracker.detection.detector import SMALLEST_TAG
 from apriltag_tracker.pipeline import (
     LimbObservation,
     LimbTracker,
@@ -107,7 +108,7 @@ class TrackerNode(LimbStateNode):
     def _make_detector(self) -> Detector:
         family = self._map.family
         side = "shortest side of a tag in px"
-        shortest = declare(self, "smallest_tag", 14.0, side, 8.0, 500.0)
+        shortest = declare(self, "smallest_tag", SMALLEST_TAG, side, 8.0, 500.0)
         forgiven = "wrong bits of a code that are forgiven in a search"
         usual, most = family.correct_bits, family.most_corrected
         bits = declare(self, "correct_bits", usual, forgiven, 0, most)
