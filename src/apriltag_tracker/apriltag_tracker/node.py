@@ -15,8 +15,7 @@ from sensor_msgs.msg import CameraInfo, Image
 
 from apriltag_tracker.camera import CameraError, Intrinsics
 from apriltag_tracker.camera.images import ImageError, ImageReader, Source, open_source
-from apriltag_tracker.detection import Detector
-from apriltag_tracker.detection.detector import SMALLEST_TAG
+from apriltag_tracker.detection import SMALLEST_TAG, Detector
 from apriltag_tracker.pipeline import (
     LimbObservation,
     LimbTracker,

@@ -100,8 +100,6 @@ class FrameAssembler:
             return []
         if not self._is_of_this_clock(name, stamp):
             return []
-        if self._told and stamp < self._frames[0][0].stamp - _CLOCK_SET:
-            self._frames, self._told = [], 0
         at = self._find(place, stamp)
         if at < self._told:
             # Of a frame that was told already: the next one waits for this body, too.
@@ -122,7 +120,9 @@ class FrameAssembler:
         """Tell whether a stamp is new and near those of the other bodies."""
         interval = stamp - self._last.get(name, stamp - _INTERVAL)
         self._last[name] = stamp
-        if interval < -_CLOCK_SET:
+        oldest = self._frames[0][0].stamp if self._frames else stamp
+        if max(interval, stamp - oldest) < -_CLOCK_SET:
+            self._frames, self._told = [], 0
             self._came.clear()
         self._came.append(stamp)
         if 0 < interval < _CLOCK_SET:
