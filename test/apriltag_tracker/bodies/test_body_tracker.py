@@ -110,7 +110,7 @@ def test_mirrored_positions_of_flat_fixed_bodies_are_named(bodies, swing):
     assert found[-1].followed.estimate is not None
     _, _, found = run(SyntheticMocap(flat(1.0)), swing, 3, BodyTracker(flat(-1.0)))
     assert found[-1].followed.estimate is None
-    assert "mirrored positions" in found[-1].followed.reason
+    assert "names and signs of fixed bodies" in found[-1].followed.reason
 
 
 def test_what_no_body_can_be_is_not_seen(bodies, swing):
@@ -123,7 +123,7 @@ def test_what_no_body_can_be_is_not_seen(bodies, swing):
         assert found.reason == "without body limb_1, limb_2"
     assert float(tracker.plane.values()["out_of_plane_mm_rms"]) < 0.2
     empty = frame._replace(quaternions=np.zeros_like(frame.quaternions))
-    assert "a quaternion that is not zero" in BodyTracker(bodies).observe(empty).followed.reason
+    assert "no fixed body with a quaternion" in BodyTracker(bodies).observe(empty).followed.reason
 
 
 @pytest.mark.parametrize("swapped", [("limb_2", "limb_4"), ("limb_4", "limb_5")])

@@ -149,8 +149,8 @@ def test_what_cannot_be_the_limb_of_the_map_is_refused_with_the_remedy(plain):
     placed = seen(plain, constant_curvature(plain.segment_lengths, [0.1, 0.2]))
     small = [dataclasses.replace(tag, pose=tag.pose * [1e-3, 1e-3, 1.0]) for tag in placed]
     for tags, unfit, said in (
-        (small, 0, "times as long as the map says: check lengths and units"),
-        ([], 5, r"5 limb tag\(s\) seen, but not as large as the map says: check size and height"),
+        (small, 0, "0.00 of the map's length: check its units"),
+        ([], 5, r"5 limb tag\(s\) do not fit the map: check size and height"),
     ):
         found = LimbFollower(plain, FollowerOptions()).follow(tags, 0.0, unfit=unfit)
         assert found.estimate is None

@@ -44,7 +44,7 @@ class PoseTrackerNode(LimbStateNode):
         self._tracker = BodyTracker(self._bodies, options, noise)
         self._assembler = FrameAssembler(self._bodies)
         self._last = 0
-        self._followed: Followed | None = None
+        self._followed = Followed(None, "")
         self._problem = ""
         self.make_outputs(len(self._bodies.segment_lengths))
         kind, places = message_type(self._form), topics_of(self._form, topic, self._bodies.names)
@@ -107,12 +107,11 @@ class PoseTrackerNode(LimbStateNode):
             return Health(level, self._problem or f"{text}: {why}{others}", values)
         if error := tracker.base.problem or self._problem:
             return Health("error", error, values)
-        told, others = self._followed, self._assembler.astray.items()
+        others = self._assembler.astray.items()
         clocks = [f"stamps of {name} are {late:.2f} s off the others'" for name, late in others]
-        reasons = [told.reason if told else "", *clocks, self._watch.other_clock()]
+        reasons = [self._followed.reason, *clocks, self._watch.other_clock()]
         if reason := "; ".join(filter(None, reasons)):
-            invalid = told is not None and told.estimate is None
-            return Health("error" if invalid else "warning", reason, values)
+            return Health("warning" if self._followed.estimate else "error", reason, values)
         return Health("ok", "tracking", values)
 
 

@@ -44,10 +44,7 @@ _FROZEN_FRAMES = 3
 """A body whose pose has been the very same for so many frames is lost."""
 _FARTHEST = 1e6
 """No body is that far away [m], whatever its unit is taken for."""
-_UPSIDE_DOWN = (
-    "the limb's bodies are upside down: check for swapped names and mirrored positions of fixed "
-    "bodies, and the rotation of each body"
-)
+_UPSIDE_DOWN = "the limb is upside down: check names and signs of fixed bodies, and rotations"
 _CLOCK_SET = 1_000_000_000
 """Stamps that go back by more than this are of a clock that was set [ns]."""
 
@@ -135,14 +132,11 @@ class FrameAssembler:
 
     def _find(self, place: int, stamp: int) -> int:
         """Return which frame lacks a body that came, and is near enough; open one if none is."""
-        apart = {
-            at: abs(frame.stamp - stamp)
-            for at, (frame, given) in enumerate(self._frames)
-            if place not in given
-        }
-        at = min(apart, key=apart.__getitem__, default=-1)
-        if at < 0 or apart[at] > _TOGETHER * _median(self._intervals):
-            at = bisect.bisect_left(self._frames, stamp, key=lambda each: each[0].stamp)
+        stamps = [frame.stamp for frame, _ in self._frames]
+        lacking = [at for at, (_, given) in enumerate(self._frames) if place not in given]
+        at = min(lacking, key=lambda at: abs(stamps[at] - stamp), default=-1)
+        if at < 0 or abs(stamps[at] - stamp) > _TOGETHER * _median(self._intervals):
+            at = bisect.bisect_left(stamps, stamp)
             if at >= self._told:
                 count = len(self._places)
                 frame = PoseFrame(stamp, np.full((count, 3), np.nan), np.full((count, 4), np.nan))
@@ -197,11 +191,7 @@ class BaseFinder:
         self._given = self.frame = bodies.frame
         self.residual = math.nan
         """RMS distance of the fixed bodies from where the map has them [m]."""
-        self.problem = (
-            ""
-            if bodies.frame
-            else "no fixed body has been seen yet, with a quaternion that is not zero"
-        )
+        self.problem = "" if bodies.frame else "no fixed body with a quaternion has been seen yet"
 
     def update(self, positions: Array, rotations: Array) -> BaseFrame | None:
         """Take one frame of all bodies and return the base to use for it, None without one.
@@ -332,16 +322,14 @@ class BodyTracker:
         stamp = frame.stamp * 1e-9
         positions = self.bodies.unit * frame.positions
         norms = np.linalg.norm(frame.quaternions, axis=1)
-        near = (np.abs(positions) < _FARTHEST).all(axis=1)
-        lost = ~(near & (norms > 0.0) & np.isfinite(norms))
+        told = (np.abs(positions) < _FARTHEST).all(axis=1) & (norms > 0.0) & (norms < np.inf)
         # No pose of a limb is exactly zero: so some systems tell that they do not see a body.
-        lost[self._index] |= ~positions[self._index].any(axis=1)
-        frozen = self._frozen(frame)
-        places = np.full((len(self._index), 3), np.nan)
-        if frozen[~lost].all() and not lost[self._index].all():
+        told[self._index] &= positions[self._index].any(axis=1)
+        frozen, places = self._frozen(frame), np.full((len(self._index), 3), np.nan)
+        if frozen[told].all() and told[self._index].any():
             paused = "the poses do not change at all: is their source paused?"
             return BodyObservation(Followed(None, paused), places)
-        lost |= frozen
+        lost = frozen | ~told
         quaternions = np.where(lost[:, None], [0.0, 0.0, 0.0, 1.0], frame.quaternions)
         rotations = Rotation.from_quat(quaternions).as_matrix()
         positions[lost], rotations[lost] = np.nan, np.nan

@@ -104,19 +104,16 @@ class LimbFollower:
         if estimate is None:
             cause = f"no limb {self._noun} {self._place}"
             if seen:
-                cause = f"what is seen of the limb contradicts itself: is each {self._noun} where "
-                cause += "the map says, and are its units right?"
+                cause = f"limb {self._noun}s contradict each other: check names, places, units"
             elif unfit:
-                cause = f"{unfit} limb {self._noun}(s) seen, but not as large as the map says: "
-                cause += "check size and height"
+                cause = f"{unfit} limb {self._noun}(s) do not fit the map: check size and height"
             return self._bridge(stamp, cause)
         self.misplaced += len(estimate.rejected)
         problem, sigma = "", estimate.tip_sigma
         if sigma > self._options.largest_tip_sigma:
             problem = f"the tip is known to {1e3 * sigma:.0f} mm only"
         elif abs(estimate.elongation - 1.0) > _STRETCH:
-            problem = f"the limb seems {estimate.elongation:.2f} times as long as the map says: "
-            problem += "check lengths and units of length"
+            problem = f"the limb has {estimate.elongation:.2f} of the map's length: check its units"
         if problem:
             self._history.clear()
             return Followed(None, "; ".join(filter(None, (problem, self._remark(estimate)))))
