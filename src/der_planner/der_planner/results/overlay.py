@@ -382,17 +382,19 @@ def write_video(run: RunSeries, path: Path) -> Path:
 
 def _write_film(run: RunSeries, path: Path, frames: Frames) -> int:
     """Write the frames as fast as they were taken; return how many."""
-    rate, count, begin = 1.0 / float(np.median(np.diff(run.tip.time))), 0, None
+    rate, count = 1.0 / float(np.median(np.diff(run.tip.time))), 0
     film = cv2.VideoWriter()
     for time, frame in frames:
-        begin = time if begin is None else begin
+        if not count:
+            begin, held = time, frame
         size = (frame.shape[1], frame.shape[0])
         if not count and not film.open(str(path), cv2.VideoWriter.fourcc(*"mp4v"), rate, size):
             raise EvaluationError(f"OpenCV cannot write the film {path}")
         # A picture stands until the next one where the camera misses some.
-        for _ in range(count, round(rate * (time - begin)) + 1):
-            film.write(frame)
-            count += 1
+        missed = max(round(rate * (time - begin)) - count, 0)
+        for each in (*[held] * missed, frame):
+            film.write(each)
+        count, held = count + missed + 1, frame
     film.release()
     return count
 
