@@ -106,7 +106,8 @@ def test_a_spoilt_picture_is_left_out_by_name():
 
 
 @pytest.mark.parametrize(
-    ("count", "tilt", "advice"), [(5, 0.5, "tilted by 20 to 40"), (12, 0.01, "same direction")]
+    ("count", "tilt", "advice"),
+    [(0, 0.5, "--columns"), (5, 0.5, "tilted by 20"), (12, 0.01, "same")],
 )
 def test_pictures_that_tell_too_little_are_refused_with_advice(count, tilt, advice):
     with pytest.raises(CalibrationError, match=advice):
@@ -151,6 +152,18 @@ def test_mounting_without_fixed_tags_names_the_cause(tags, model):
     blank = [np.zeros((720, 1280), np.uint8)]
     with pytest.raises(CalibrationError, match="no fixed tag"):
         calibrate_mounting(blank, tags, model.intrinsics)
+
+
+def test_mounting_pictures_of_another_size_are_named_in_one_line(
+    tmp_path, monkeypatch, capsys, model
+):
+    lens, words = tmp_path / "camera.yaml", ["mounting", str(tmp_path)]
+    model.intrinsics.to_yaml(lens)
+    cv2.imwrite(str(tmp_path / "small.png"), np.zeros((480, 640), np.uint8))
+    words += ["--calibration", str(lens), "--out", str(tmp_path / "tags.yaml")]
+    monkeypatch.setattr(sys, "argv", ["calibrate_camera.py", *words])
+    assert calibrate_camera.main() == 1
+    assert "640 x 480 px but the calibration is for 1280 x 720" in capsys.readouterr().err
 
 
 @pytest.mark.slow

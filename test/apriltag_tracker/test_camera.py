@@ -87,6 +87,7 @@ def test_calibration_survives_its_file(tmp_path, distortion):
     [
         ((0, 720, MATRIX, []), "1280|0 x 720"),
         ((1280, 720, MATRIX, [0.0] * 12), "12 distortion"),
+        ((1280, 720, MATRIX, [0.1] * 6), "6 distortion"),
         ((1280, 720, MATRIX, [], "equidistant"), "equidistant"),
         ((1280, 720, [np.nan] * 9, []), "not calibrated"),
         ((1280, 720, [0.0] * 9, []), "calibrate_camera"),
@@ -97,10 +98,17 @@ def test_impossible_calibrations_are_refused(arguments, message):
         Intrinsics.create(*arguments)
 
 
-@pytest.mark.parametrize("text", ["", "a: 1", "[1, 2", "image_width: x"])
+LETTERS = """image_width: 1280
+image_height: 720
+camera_matrix: {data: [a, 0, 0, 0, 1, 0, 0, 0, 1]}
+distortion_coefficients: {data: []}
+"""
+
+
+@pytest.mark.parametrize("text", ["", "a: 1", "[1, 2", "image_width: x", LETTERS, "é: 1"])
 def test_files_that_are_no_calibration_are_named(tmp_path, text):
     path = tmp_path / "camera.yaml"
-    path.write_text(text)
+    path.write_text(text, encoding="latin-1")
     with pytest.raises(CameraError, match=r"camera\.yaml"):
         Intrinsics.from_yaml(path)
     with pytest.raises(CameraError, match="nowhere"):

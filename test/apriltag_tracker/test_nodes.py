@@ -7,9 +7,13 @@ import array
 import cv2
 import numpy as np
 import pytest
+import rclpy
+from domain import own_domain
 from geometry_msgs.msg import Point
 from sensor_msgs.msg import CameraInfo, Image
 
+from apriltag_tracker.bodies.node import PoseTrackerNode
+from apriltag_tracker.bodies.tracker import PoseFrame
 from apriltag_tracker.synthetic.camera import SyntheticCamera
 from apriltag_tracker.synthetic.shapes import constant_curvature
 from der_msgs.msg import LimbShape, LimbState, TagDetectionArray
@@ -190,3 +194,21 @@ def test_poses_of_motion_capture_become_the_tip(graph, states, config, tags, tmp
         lambda: client.diagnostic_values("pose_tracker").get("plane_tilt_deg"), PATIENCE, "a plane"
     )
     assert float(told) < 1.0
+
+
+def test_poses_that_tell_no_limb_are_an_error_with_all_that_is_known():
+    rclpy.init(domain_id=own_domain(__file__))
+    try:
+        node = PoseTrackerNode()
+        node._assembler.astray["limb_5"] = 3.0
+        frame = PoseFrame(10**9, np.full((8, 3), np.nan), np.full((8, 4), np.nan))
+        node._on_frame(frame)
+        node._tracker.base.problem = ""
+        told = node._health()
+        node.destroy_node()
+    finally:
+        rclpy.shutdown()
+    assert told.level == "error"
+    assert "no base" in told.message
+    assert "stamps of limb_5 are 3.00 s off the others'" in told.message
+    assert "s old: are they of another clock?" in told.message

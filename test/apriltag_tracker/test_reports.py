@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import dataclasses
+import re
+
 import numpy as np
 import pytest
 from waiting import Clock
@@ -51,7 +54,7 @@ def test_a_stream_that_stops_is_an_error(clock, tracker, camera, swing):
     watch = ImageWatch("topic", True, clock)
     for k in range(5):
         clock.now += 0.1
-        watch.arrived(0)
+        watch.arrived(k)
         frame = camera.frame(swing.shape(0.0))
         watch.observed(tracker.observe(frame.image, float(k)), 0.004, 0.002)
     assert watch.report(tracker, 1) == ("ok", "tracking")
@@ -61,6 +64,36 @@ def test_a_stream_that_stops_is_an_error(clock, tracker, camera, swing):
     assert values["processing_ms_p99"] == "2.00"
     clock.now += 3.0
     assert watch.report(tracker, 1)[0] == "error"
+
+
+def test_stamps_that_tell_no_time_are_named(clock, tracker, camera, swing):
+    watch, image = ImageWatch("topic", True, clock), camera.frame(swing.shape(0.0)).image
+    assert [watch.arrived(stamp) for stamp in (0, 0, 7, 7, 8)] == [True, False, True, False, True]
+    assert watch.repeated == 2
+    watch.observed(tracker.observe(image, 0.0), 90.0, 0.002)
+    level, message = watch.report(tracker)
+    assert level == "warning"
+    assert "topic are 90 s old: are they of another clock" in message
+    for _ in range(20):
+        watch.arrived(8)
+    level, message = watch.report(tracker)
+    assert level == "error"
+    assert "no stamps, or all the same" in message
+
+
+@pytest.mark.parametrize("height", [0.0, 0.06])
+def test_limb_tags_that_all_look_too_large_or_small_are_a_warning(
+    clock, tags, model, camera, swing, height
+):
+    limb = tuple(dataclasses.replace(tag, height=height) for tag in tags.limb)
+    tracker = LimbTracker(dataclasses.replace(tags, limb=limb), model.intrinsics)
+    watch, image = ImageWatch("topic", True, clock), camera.frame(swing.shape(0.0)).image
+    for k in range(40):
+        watch.arrived(k)
+        watch.observed(tracker.observe(image, k / 30.0), 0.004, 0.002)
+    level, message = watch.report(tracker)
+    assert level == "warning"
+    assert re.search("look [45] % larger or smaller than the tag map says: check height", message)
 
 
 def test_problems_come_before_the_state(clock, tracker):

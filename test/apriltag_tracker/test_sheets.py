@@ -74,6 +74,8 @@ def test_what_does_not_fit_is_refused():
         board_page(BoardLayout(columns=20))
     with pytest.raises(SheetError, match="half millimetres"):
         board_page(BoardLayout(square=0.0251))
+    with pytest.raises(SheetError, match="3 or more"):
+        BoardLayout(rows=2)
 
 
 def test_many_tags_take_several_pages():

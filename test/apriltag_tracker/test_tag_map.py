@@ -39,6 +39,10 @@ def _set(*path, value):
         (_set("limb", "segment_lengths", value=[0.1, -0.1]), "segment_lengths"),
         (_set("limb", "tags", value=[]), "at least one"),
         (_set("limb", "tags", 0, "id", value=700), "700"),
+        (_set("limb", "tags", 1, "id", value=True), "id True"),
+        (_set("limb", "tags", 0, "hight", value=0.03), "limb tag 0: unknown key 'hight'"),
+        (_set("world", "tags", 0, "yaaw", value=1.0), "world tag 100: unknown key 'yaaw'"),
+        (_set("world", "tags", value=[]), "world.tags is empty"),
         (_set("limb", "tags", 0, "arc_length", value=0.5), "arc_length 0.5"),
         (_set("limb", "tags", 0, "size", value=0.0), "size"),
         (_set("limb", "tags", 0, "offset", value=[0.0]), "offset"),
@@ -61,6 +65,9 @@ def test_files_are_named(tmp_path):
     path = tmp_path / "tags.yaml"
     path.write_text("[1, 2")
     with pytest.raises(MapError, match="not YAML"):
+        TagMap.from_yaml(path)
+    path.write_text("schema: 1  # é", encoding="latin-1")
+    with pytest.raises(MapError, match=r"tags\.yaml.*utf-8"):
         TagMap.from_yaml(path)
     path.write_text("schema: 2")
     with pytest.raises(MapError, match=r"tags\.yaml.*schema"):

@@ -157,7 +157,7 @@ def measure_swing(frames: int, exposure: float) -> dict[str, float]:
     tags = dataclasses.replace(TagMap.from_yaml(CONFIG / "tags.yaml"), stiff=())
     model = CameraModel.from_yaml(CONFIG / "synthetic_camera.yaml")
     camera = SyntheticCamera(model, tags, Optics(exposure=exposure))
-    tracker, detector = LimbTracker(tags, model.intrinsics), Detector(smallest=14.0)
+    tracker, detector = LimbTracker(tags, model.intrinsics), Detector()
     times, searches, renders, gaps, nees, corners, asked = [], [], [], [], [], [], 0
     for k in range(frames):
         shape, later = swing(tags, k * PERIOD), swing(tags, k * PERIOD + 1e-3)

@@ -15,7 +15,7 @@ from sensor_msgs.msg import CameraInfo, Image
 
 from apriltag_tracker.camera import CameraError, Intrinsics
 from apriltag_tracker.camera.images import ImageError, ImageReader, Source, open_source
-from apriltag_tracker.detection import Detector
+from apriltag_tracker.detection import SMALLEST_TAG, Detector
 from apriltag_tracker.pipeline import (
     LimbObservation,
     LimbTracker,
@@ -57,7 +57,6 @@ class TrackerNode(LimbStateNode):
         warm_up(self._detector)
         self._tracker: LimbTracker | None = None
         self._reader = ImageReader()
-        self._last_stamp = -1
         self._frame = ""
         self._level = ""
         self._image_topic = self.resolve_topic_name(topics.IMAGE)
@@ -108,7 +107,7 @@ class TrackerNode(LimbStateNode):
     def _make_detector(self) -> Detector:
         family = self._map.family
         side = "shortest side of a tag in px"
-        shortest = declare(self, "smallest_tag", 14.0, side, 8.0, 500.0)
+        shortest = declare(self, "smallest_tag", SMALLEST_TAG, side, 8.0, 500.0)
         forgiven = "wrong bits of a code that are forgiven in a search"
         usual, most = family.correct_bits, family.most_corrected
         bits = declare(self, "correct_bits", usual, forgiven, 0, most)
@@ -167,13 +166,11 @@ class TrackerNode(LimbStateNode):
     def _process(self, gray: NDArray[np.uint8], stamp: Time) -> None:
         """Process one image and publish what it says under its own stamp."""
         started = time.perf_counter()
-        self._watch.arrived(stamps.nanoseconds(stamp))
-        if stamps.nanoseconds(stamp) == self._last_stamp:
+        taken = stamps.nanoseconds(stamp)
+        if not self._watch.arrived(taken):
             # The same picture again says nothing new.
-            self._watch.repeated += 1
             return
-        self._last_stamp = stamps.nanoseconds(stamp)
-        stamp = stamps.stamp_from_nanoseconds(self._last_stamp - self.sensor_delay)
+        stamp = stamps.stamp_from_nanoseconds(taken - self.sensor_delay)
         if self._tracker is None:
             self._fail(stamp, self._watch.calibration_problem or NO_CALIBRATION)
             return

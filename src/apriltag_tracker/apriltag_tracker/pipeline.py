@@ -8,13 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from apriltag_tracker.camera import CameraPose, Intrinsics
+from apriltag_tracker.camera import CameraError, CameraPose, Intrinsics
 from apriltag_tracker.detection import Detector, Tag
 from apriltag_tracker.detection.tracking import FULL_SEARCH_PERIOD, TagTracker
 from apriltag_tracker.pose.following import LimbFollower, survey_errors
 from apriltag_tracker.pose.shape import FollowerOptions, LimbEstimate, PlanarTag, centreline_pose
 from apriltag_tracker.pose.world import WorldPose, locate
 from apriltag_tracker.tag_map import LimbTag, TagMap, WorldTag
+
+_SIZE_MEMORY = 20
+"""Pictures over which the size of the limb's tags is averaged."""
 
 
 @dataclass(frozen=True)
@@ -92,6 +95,8 @@ class LimbTracker:
         self.tracker = TagTracker(self._flat, detector, self.options.full_search_period)
         self.world = WorldPose(tags, intrinsics)
         self.follower = LimbFollower(tags, self.options)
+        self.size_error = 0.0
+        """Share by which limb tags look larger or smaller than the tag map says, all alike."""
 
     def observe(
         self, gray: NDArray[np.uint8], stamp: float, search_later: bool = False
@@ -104,11 +109,11 @@ class LimbTracker:
             search_later: leave what cannot change the answer to `search_again`.
 
         Raises:
-            ValueError: the image is none, or has another size than the calibration.
+            CameraError: the image has another size than the calibration.
         """
         size = self.intrinsics
         if gray.shape[:2] != (size.height, size.width):
-            raise ValueError(
+            raise CameraError(
                 f"the image has {gray.shape[1]} x {gray.shape[0]} px but the calibration is for "
                 f"{size.width} x {size.height}: calibrate at the resolution that is used"
             )
@@ -136,11 +141,12 @@ class LimbTracker:
             self.intrinsics,
             pose,
         )
-        used = [
-            i
-            for i, tag in enumerate(found)
-            if tag.id in self._limb_tags and misfits[i] <= self.options.largest_misfit * flat[i, 1]
-        ]
+        limb = [i for i, tag in enumerate(found) if tag.id in self._limb_tags]
+        if limb:
+            # Corners of a square that is too large are off by this share of half its diagonal.
+            share = np.sqrt(2.0) * float(np.median(misfits[limb] / flat[limb, 1]))
+            self.size_error += (share - self.size_error) / _SIZE_MEMORY
+        used = [i for i in limb if misfits[i] <= self.options.largest_misfit * flat[i, 1]]
         planar = []
         for i in used:
             entry = self._limb_tags[found[i].id]
@@ -152,7 +158,8 @@ class LimbTracker:
             for tag, place in zip(found, places, strict=True)
         )
         root = np.linalg.cholesky(self.world.covariance + 1e-18 * np.eye(6))
-        followed = self.follower.follow(planar, stamp, common, moves[used] @ root)
+        unfit = len(limb) - len(used)
+        followed = self.follower.follow(planar, stamp, common, moves[used] @ root, unfit)
         return LimbObservation(placed, *followed)
 
     def _common_errors(

@@ -18,6 +18,10 @@ NO_CALIBRATION = (
     "(scripts/calibrate_camera.py writes one)"
 )
 
+_REPEATS = 10
+"""So many images in a row with one stamp are more than a picture that was sent again."""
+_SIZE_ERROR = 0.03
+"""Tags of 14 px look larger or smaller by a third of this from noise."""
 _TAG = (60, 200, 60)
 _WORLD = (220, 160, 40)
 _CURVE = (40, 120, 255)
@@ -63,6 +67,8 @@ class ImageWatch(StreamWatch):
         """
         if silence := self.silence():
             return self._silence(*silence, publishers)
+        if self._again > _REPEATS:
+            return "error", f"images from {self._source} have no stamps, or all the same: set them"
         if tracker is None:
             return "error", self.calibration_problem or NO_CALIBRATION
         if self.image_problem:
@@ -84,9 +90,14 @@ class ImageWatch(StreamWatch):
         last, world = self._last, tracker.world
         if last is None or last.estimate is None:
             return "error", last.reason if last is not None else "no image has been processed"
+        if clock := self.other_clock():
+            return "warning", clock
         if world.excluded:
             named = ", ".join(f"{tag} ({gap:.1f} px)" for tag, gap in world.excluded.items())
             return "warning", f"fixed tags that do not fit the others: {named}"
+        if tracker.size_error > _SIZE_ERROR:
+            off = f"the limb's tags look {100 * tracker.size_error:.0f} % larger or smaller"
+            return "warning", f"{off} than the tag map says: check height and size"
         if world.bumps:
             return (
                 "warning",

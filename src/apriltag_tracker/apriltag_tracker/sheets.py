@@ -64,9 +64,9 @@ class BoardLayout:
         Raises:
             SheetError: there are too few squares, or the markers do not fit into them.
         """
-        if min(self.columns, self.rows) < 2:
+        if min(self.columns, self.rows) < 3:
             raise SheetError(
-                f"a board of {self.columns} x {self.rows} squares: take 2 or more each way"
+                f"a board of {self.columns} x {self.rows} squares: take 3 or more each way"
             )
         if not 0.0 < self.marker < self.square < math.inf:
             raise SheetError(

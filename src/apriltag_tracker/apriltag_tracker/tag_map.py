@@ -107,7 +107,7 @@ class LimbGeometry(ABC):
             return cls.from_dict(yaml.safe_load(Path(path).read_text()))
         except OSError as error:
             raise MapError(f"cannot read the map {path}: {error.strerror}") from error
-        except yaml.YAMLError as error:
+        except (yaml.YAMLError, UnicodeDecodeError) as error:
             raise MapError(f"the map {path} is not YAML: {error}") from error
         except MapError as error:
             raise MapError(f"{path}: {error}") from error
@@ -182,6 +182,8 @@ class TagMap(LimbGeometry):
         if not limb_tags:
             raise MapError("limb.tags is empty: at least one tag must be on the limb")
         world_tags = tuple(_world_tag(entry) for entry in world.get("tags") or [])
+        if not world_tags:
+            raise MapError("world.tags is empty: fixed tags tell where the camera is")
         return cls(lengths, limb_tags, world_tags, family, stiff=stiff)
 
 
@@ -195,6 +197,12 @@ def on_limb(
     height = number(entry.get("height"), f"{name}: height")
     along, across, angle = floats(entry.get("offset", [0.0, 0.0, 0.0]), 3, f"{name}: offset")
     return arc_length, height, (along, across, angle)
+
+
+def check_keys(entry: dict[str, Any], known: set[str], name: str) -> None:
+    """Refuse keys of an entry that nobody reads; raises `MapError`."""
+    if unknown := sorted(map(str, entry.keys() - known)):
+        raise MapError(f"{name}: unknown key '{unknown[0]}'; known: {', '.join(sorted(known))}")
 
 
 def section(data: dict[str, Any], name: str) -> dict[str, Any]:
@@ -231,13 +239,14 @@ def _stiff(value: Any, lengths: Lengths) -> Stretches:
     return tuple(result)
 
 
-def _common(entry: Any, where: str) -> tuple[int, float, str]:
+def _common(entry: Any, where: str, keys: set[str]) -> tuple[int, float, str]:
     if not isinstance(entry, dict):
         raise MapError(f"{where}: an entry 'id: …, size: …' expected, not {entry!r}")
     tag = entry.get("id")
-    if not isinstance(tag, int):
+    if isinstance(tag, bool) or not isinstance(tag, int):
         raise MapError(f"{where}: id {tag!r} is no whole number")
     name = f"{where} {tag}"
+    check_keys(entry, keys | {"id", "size"}, name)
     size = number(entry.get("size"), f"{name}: size")
     if size <= 0.0:
         raise MapError(f"{name}: size {size} m must be positive")
@@ -245,13 +254,13 @@ def _common(entry: Any, where: str) -> tuple[int, float, str]:
 
 
 def _limb_tag(entry: Any, total: float) -> LimbTag:
-    tag, size, name = _common(entry, "limb tag")
+    tag, size, name = _common(entry, "limb tag", {"arc_length", "height", "offset"})
     arc_length, height, offset = on_limb(entry, total, name)
     return LimbTag(tag, arc_length, height, size, offset)
 
 
 def _world_tag(entry: Any) -> WorldTag:
-    tag, size, name = _common(entry, "world tag")
+    tag, size, name = _common(entry, "world tag", {"position", "yaw"})
     position = floats(entry.get("position"), 3, f"{name}: position")
     yaw = number(entry.get("yaw", 0.0), f"{name}: yaw")
     return WorldTag(tag, (position[0], position[1], position[2]), yaw, size)

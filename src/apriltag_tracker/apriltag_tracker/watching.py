@@ -10,6 +10,8 @@ import numpy as np
 
 SILENCE = 2.0
 """Without an image or a frame of poses for this long [s] something is wrong."""
+_CLOCKS_APART = 5.0
+"""No state is this late or early [s] by one clock."""
 _WINDOW = 300
 _INTERVALS = 100
 """So many tell the period of a stream."""
@@ -63,14 +65,20 @@ class StreamWatch:
         self.repeated = self.invalid = self.bridged = 0
         self._arrivals: collections.deque[float] = collections.deque(maxlen=_WINDOW)
         self._gaps = StampGaps()
+        self._stamp, self._again = -1, 0
+        """The last stamp [ns], and how often it came again."""
         self._latency: collections.deque[float] = collections.deque(maxlen=_WINDOW)
         self._work: collections.deque[float] = collections.deque(maxlen=_WINDOW)
 
-    def arrived(self, stamp: int) -> None:
-        """One came that has a stamp [ns]; zero: none."""
+    def arrived(self, stamp: int) -> bool:
+        """One came that has a stamp [ns], zero: none; tell whether the one before had another."""
         self.received += 1
         self._gaps.take(stamp)
         self._arrivals.append(self._clock())
+        self._again = self._again + 1 if stamp == self._stamp else 0
+        self._stamp = stamp
+        self.repeated += self._again > 0
+        return self._again == 0
 
     def counted(self, valid: bool, bridged: bool, latency: float, work: float) -> None:
         """One was processed; latency from its stamp and time of the work in s."""
@@ -90,6 +98,13 @@ class StreamWatch:
             return None
         said = f"no {self._noun} from {self._source} for {silent:.0f} s"
         return "error" if self._arrivals else "stale", said
+
+    def other_clock(self) -> str:
+        """Return what to say of stamps that are no times of this computer; empty if they are."""
+        late = float(np.median(self._latency)) if self._latency else 0.0
+        if abs(late) < _CLOCKS_APART:
+            return ""
+        return f"stamps from {self._source} are {late:.0f} s old: are they of another clock?"
 
     def values(self) -> dict[str, object]:
         """Return the numbers by name."""

@@ -91,6 +91,41 @@ def test_a_body_that_stands_still_while_others_move_is_lost(bodies, swing):
     assert "without body limb_4" in seen.followed.reason
 
 
+def test_poses_that_do_not_change_at_all_are_of_a_paused_source(bodies, swing):
+    frame, tracker = SyntheticMocap(bodies, NOISE).frame(0, swing.shape(0.0)), BodyTracker(bodies)
+    found = [tracker.observe(frame._replace(stamp=k * 10**7)).followed for k in range(6)]
+    assert [each.estimate is None for each in found] == [False] * 3 + [True] * 3
+    assert "is their source paused?" in found[-1].reason
+
+
+def test_mirrored_positions_of_flat_fixed_bodies_are_named(bodies, swing):
+    def flat(side):
+        places = [body.position * [1.0, side, 0.0] for body in bodies.fixed]
+        fixed = zip(bodies.fixed, places, strict=True)
+        return dataclasses.replace(
+            bodies, fixed=tuple(dataclasses.replace(b, position=p, rotation=None) for b, p in fixed)
+        )
+
+    _, _, found = run(SyntheticMocap(flat(1.0)), swing, 3, BodyTracker(flat(1.0)))
+    assert found[-1].followed.estimate is not None
+    _, _, found = run(SyntheticMocap(flat(1.0)), swing, 3, BodyTracker(flat(-1.0)))
+    assert found[-1].followed.estimate is None
+    assert "names and signs of fixed bodies" in found[-1].followed.reason
+
+
+def test_what_no_body_can_be_is_not_seen(bodies, swing):
+    mocap, tracker = SyntheticMocap(bodies, NOISE), BodyTracker(bodies)
+    for k in range(300):
+        frame = mocap.frame(round(k * PERIOD * 1e9), swing.shape(k * PERIOD))
+        frame.positions[bodies.names.index("limb_1")] = 1e300
+        frame.positions[bodies.names.index("limb_2")] = 0.0
+        found = tracker.observe(frame._replace(quaternions=0.5 * frame.quaternions)).followed
+        assert found.reason == "without body limb_1, limb_2"
+    assert float(tracker.plane.values()["out_of_plane_mm_rms"]) < 0.2
+    empty = frame._replace(quaternions=np.zeros_like(frame.quaternions))
+    assert "no fixed body with a quaternion" in BodyTracker(bodies).observe(empty).followed.reason
+
+
 @pytest.mark.parametrize("swapped", [("limb_2", "limb_4"), ("limb_4", "limb_5")])
 def test_bodies_with_each_others_names_tell_no_tip(bodies, swing, swapped):
     faults = dataclasses.replace(NOISE, swapped=swapped, swapped_from=0.5)
@@ -162,6 +197,12 @@ def stamps_of(assembler, *come):
     return told
 
 
+def every_10_ms(assembler, count, **late):
+    """Take all bodies so often, late by some ms; return the stamps of the frames."""
+    come = [f"{name} {10 * k + after}" for k in range(count) for name, after in late.items()]
+    return [stamp for frames in stamps_of(assembler, *come) for stamp in frames]
+
+
 def test_poses_that_come_one_by_one_become_frames(assembler):
     assert stamps_of(assembler, "a 0", "b 0") == [[], []]
     (frame,) = assembler.take("c", 400_000, pose(3.0))
@@ -185,6 +226,19 @@ def test_a_body_that_is_lost_holds_up_frames_and_comes_back(assembler):
     assert told == [[], [], [], [], [20], [30, 40], [], [50]]
     told = stamps_of(assembler, "c 50", "a 60", "b 60", "c 60")
     assert told == [[], [], [], [60]]
+
+
+def test_bodies_may_be_stamped_one_by_one(assembler):
+    assert every_10_ms(assembler, 4, a=0, b=2, c=4.5) == [0, 10, 20, 30]
+    # The second is late, the first comes early.
+    assert stamps_of(assembler, "c 44", "a 41", "b 43.5")[-1] == [44]
+
+
+def test_a_body_of_another_clock_is_left_out_by_name(assembler):
+    told = every_10_ms(assembler, 20, a=0, b=3000, c=0)
+    assert told == [10 * k for k in range(len(told))]
+    assert len(told) >= 18
+    assert assembler.astray == pytest.approx({"b": 3.0}, abs=0.01)
 
 
 def test_a_clock_that_was_set_back_begins_anew(assembler):

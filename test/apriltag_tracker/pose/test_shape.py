@@ -1,11 +1,13 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
 
 from apriltag_tracker.pose.curve import Curve, Evaluation
+from apriltag_tracker.pose.following import LimbFollower
 from apriltag_tracker.pose.shape import (
     FollowerOptions,
     PlanarTag,
@@ -127,3 +129,32 @@ def test_tags_that_contradict_each_other_give_nothing(tags):
     ]
     assert ShapeFitter(tags).fit(placed) is None
     assert ShapeFitter(tags).fit([]) is None
+
+
+@pytest.mark.parametrize(
+    ("last", "stamp", "told"),
+    [(0.41, 0.06, True), (0.41, 3.0, False), (0.41, -1.0, False), (0.6, 0.06, False)],
+)
+def test_a_gap_is_bridged_for_a_few_usual_frames_while_the_tip_is_known(plain, last, stamp, told):
+    follower = LimbFollower(plain, FollowerOptions())
+    for k, bend in enumerate((0.4, last)):
+        shape = constant_curvature(plain.segment_lengths, [bend, bend])
+        assert follower.follow(seen(plain, shape), 0.03 * k).estimate is not None
+    found = follower.follow([], stamp)
+    assert (found.estimate is not None) == found.bridged == told
+    assert "no limb tag in the image" in found.reason
+
+
+def test_what_cannot_be_the_limb_of_the_map_is_refused_with_the_remedy(plain):
+    placed = seen(plain, constant_curvature(plain.segment_lengths, [0.1, 0.2]))
+    small = [dataclasses.replace(tag, pose=tag.pose * [1e-3, 1e-3, 1.0]) for tag in placed]
+    for tags, unfit, said in (
+        (small, 0, "0.00 of the map's length: check its units"),
+        ([], 5, r"5 limb tag\(s\) do not fit the map: check size and height"),
+    ):
+        found = LimbFollower(plain, FollowerOptions()).follow(tags, 0.0, unfit=unfit)
+        assert found.estimate is None
+        assert re.search(said, found.reason)
+    alone = dataclasses.replace(plain, limb=plain.limb[:1])
+    found = LimbFollower(alone, FollowerOptions()).follow(placed[:1], 0.0)
+    assert re.fullmatch(r"the tip is known to \d+ mm only", found.reason)

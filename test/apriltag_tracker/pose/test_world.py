@@ -30,17 +30,19 @@ def test_a_bump_is_noticed_and_followed(tags, model):
     for _ in range(40):
         world.update(tags_seen(tags, model, model.pose))
     pushed = CameraPose.looking_down((0.130, 0.006, 0.600), -1.560, (0.030, -0.020))
-    for _ in range(5):
-        pose = world.update(tags_seen(tags, model, pushed))
+    poses = [world.update(tags_seen(tags, model, pushed)) for _ in range(5)]
+    assert [pose is None for pose in poses] == [True, True, False, False, False]
+    pose = poses[-1]
     assert world.bumps == 1
     assert np.allclose(pose.position, pushed.position, atol=1e-6)
 
 
 def test_one_noisy_frame_is_no_bump(tags, model):
-    world = WorldPose(tags, model.intrinsics)
+    world, random = WorldPose(tags, model.intrinsics), np.random.default_rng(1)
     for k in range(40):
         moved = {entry.id: 3.0 for entry in tags.world} if k == 20 else None
-        world.update(tags_seen(tags, model, model.pose, moved=moved))
+        pose = world.update(tags_seen(tags, model, model.pose, 0.15, random, moved))
+        assert (pose is None) == (k == 20), world.problem
     assert world.bumps == 0
 
 
@@ -49,6 +51,19 @@ def test_a_fixed_tag_on_the_wrong_place_is_left_out_by_name(tags, model):
     pose = world.update(tags_seen(tags, model, model.pose, moved={103: np.array([6.0, -4.0])}))
     assert list(world.excluded) == [103]
     assert np.allclose(pose.position, model.pose.position, atol=1e-5)
+
+
+def test_two_of_six_fixed_tags_may_be_wrong_but_most_must_agree(tags, model):
+    shifts = np.array([(8.0, -8.0), (-8.0, -8.0)])
+    moved = {entry.id: shift for entry, shift in zip(tags.world, shifts, strict=False)}
+    world = WorldPose(tags, model.intrinsics)
+    world.update(tags_seen(tags, model, model.pose, moved=moved))
+    assert set(world.excluded) == set(moved)
+    # The calibration of another lens bends the picture outward where this one bends it inward.
+    wrong = dataclasses.replace(model.intrinsics, distortion=-model.intrinsics.distortion)
+    world = WorldPose(tags, wrong)
+    assert world.update(tags_seen(tags, model, model.pose)) is None
+    assert "of 6 fixed tags fit together" in world.problem
 
 
 def test_a_map_that_fits_nothing_gives_no_pose(tags, model):

@@ -33,10 +33,10 @@ class FilmedRun(BagOfRun):
         about = {"height": 240, "width": 320, "encoding": "mono8", "step": 320}
         self.write("/limb/camera/image_raw", "sensor_msgs/msg/Image", seconds, data=data, **about)
 
-    def calibration(self) -> None:
+    def calibration(self, matrix: np.ndarray = CAMERA) -> None:
         about = {"height": 240, "width": 320, "distortion_model": "plumb_bob"}
         name = "sensor_msgs/msg/CameraInfo"
-        self.write("/limb/camera/camera_info", name, 0.0, d=DISTORTION, k=CAMERA.ravel(), **about)
+        self.write("/limb/camera/camera_info", name, 0.0, d=DISTORTION, k=matrix.ravel(), **about)
 
     def tags(self, seconds: float, centres: np.ndarray) -> None:
         square = 0.01 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])

@@ -82,13 +82,16 @@ def test_report_is_one_page_with_everything_in_it(bag: Path, tmp_path: Path):
     assert rows["pcc"] == pytest.approx(0.01, abs=5e-5)
 
 
-def test_film_has_every_frame(bag: Path, tmp_path: Path):
+def test_film_is_as_long_as_the_run(bag: Path, tmp_path: Path):
+    """The states have the rate of a camera of which the bag lacks nine pictures of ten."""
     path = write_video(load_run(bag), tmp_path / "film.mp4")
     film = cv2.VideoCapture(str(path))
     count = 0
     while film.read()[0]:
         count += 1
-    assert count == len(FRAMES[FRAMES >= 0][::10])
+    shown = FRAMES[FRAMES >= 0][::10]
+    assert count == 10 * (len(shown) - 1) + 1
+    assert count / film.get(cv2.CAP_PROP_FPS) == pytest.approx(shown[-1] - shown[0], abs=0.1)
 
 
 def test_an_animated_picture_shows_the_motion_alone(bag: Path, tmp_path: Path):
@@ -97,6 +100,28 @@ def test_an_animated_picture_shows_the_motion_alone(bag: Path, tmp_path: Path):
     shown = FRAMES[FRAMES >= 0][::10]
     assert len(film.frames) == np.count_nonzero(shown <= TIMES[-1])
     assert film.frames[0].shape[:2] == (420, 560)
+
+
+def test_pictures_that_are_stamped_late_show_the_limb_of_their_exposure(tmp_path: Path):
+    run, late = FilmedRun(tmp_path / "late"), 0.07
+    run.plan()
+    run.calibration(np.zeros((3, 3)))
+    for index, when in enumerate(FRAMES[FRAMES >= 0][:60]):
+        jitter = 0.002 * (index % 7)
+        point = run.make("geometry_msgs/msg/Point", x=float(index))
+        run.write("/limb/state", "LimbState", when + jitter, valid=True, curve=[point], tip=point)
+        run.frame(when + jitter + late, shade=index)
+        run.tags(when + jitter, np.zeros((5, 2)))
+    for index in range(len(TIMES)):
+        run.setpoint(index, [0.0, 0.0])
+    path = run.bag.close()
+    with BagReader(path) as reader:
+        images = RunImages(reader, load_run(path))
+        shots = list(images.pictures())
+        assert images.projection() is None, "the calibration is all zeros"
+        assert images.snapshot(shots[30][0]).picture[0, 0] == 30
+    assert [shot.measured[0, 0] for _, shot in shots] == [shot.picture[0, 0] for _, shot in shots]
+    assert shots[1][0] == pytest.approx(FRAMES[FRAMES >= 0][1] + 0.002)
 
 
 def test_bag_without_images_has_shapes_but_no_film(tmp_path: Path):

@@ -14,6 +14,7 @@ from apriltag_tracker.tag_map import (
     LimbGeometry,
     MapError,
     Stretches,
+    check_keys,
     floats,
     on_limb,
     section,
@@ -139,8 +140,7 @@ def _body(entry: Any, total: float) -> BodyOnLimb | FixedBody:
     if not isinstance(entry, dict) or not isinstance(entry.get("name"), str):
         raise MapError(f"bodies: an entry 'name: …, arc_length: …' expected, not {entry!r}")
     name = f"body {entry['name']}"
-    if unknown := sorted(entry.keys() - _KEYS):
-        raise MapError(f"{name}: unknown key '{unknown[0]}'; known: {', '.join(sorted(_KEYS))}")
+    check_keys(entry, _KEYS, name)
     turn = _rotation(entry["rotation"], name) if "rotation" in entry else None
     if "arc_length" not in entry:
         if entry.get("place") not in ("clamp", "world"):

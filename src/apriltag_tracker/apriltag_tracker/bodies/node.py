@@ -12,6 +12,7 @@ from geometry_msgs.msg import Pose2D
 from apriltag_tracker.bodies.body_map import BodyMap
 from apriltag_tracker.bodies.forms import FORMS, PoseFormError, message_type, poses_of, topics_of
 from apriltag_tracker.bodies.tracker import BodyNoise, BodyTracker, FrameAssembler, PoseFrame
+from apriltag_tracker.pose.following import Followed
 from apriltag_tracker.pose.node import LimbStateNode
 from apriltag_tracker.pose.shape import FollowerOptions
 from apriltag_tracker.watching import StreamWatch
@@ -43,7 +44,8 @@ class PoseTrackerNode(LimbStateNode):
         self._tracker = BodyTracker(self._bodies, options, noise)
         self._assembler = FrameAssembler(self._bodies)
         self._last = 0
-        self._reason = self._problem = ""
+        self._followed = Followed(None, "")
+        self._problem = ""
         self.make_outputs(len(self._bodies.segment_lengths))
         kind, places = message_type(self._form), topics_of(self._form, topic, self._bodies.names)
         for name, place in places.items():
@@ -74,7 +76,7 @@ class PoseTrackerNode(LimbStateNode):
         self._last = frame.stamp
         observation = self._tracker.observe(frame)
         followed, stamp = observation.followed, stamps.stamp_from_nanoseconds(frame.stamp)
-        self._reason = followed.reason
+        self._followed = followed
         latency = self.publish_state(followed.estimate, followed.reason, stamp)
         # The limb's bodies are tags without corners; the id is the place in the body map.
         places = enumerate(observation.places.tolist())
@@ -105,8 +107,11 @@ class PoseTrackerNode(LimbStateNode):
             return Health(level, self._problem or f"{text}: {why}{others}", values)
         if error := tracker.base.problem or self._problem:
             return Health("error", error, values)
-        if self._reason:
-            return Health("warning", self._reason, values)
+        others = self._assembler.astray.items()
+        clocks = [f"stamps of {name} are {late:.2f} s off the others'" for name, late in others]
+        reasons = [self._followed.reason, *clocks, self._watch.other_clock()]
+        if reason := "; ".join(filter(None, reasons)):
+            return Health("warning" if self._followed.estimate else "error", reason, values)
         return Health("ok", "tracking", values)
 
 

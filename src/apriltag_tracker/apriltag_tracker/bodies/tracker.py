@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import bisect
 import math
+from collections import deque
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
@@ -33,12 +34,17 @@ _LEAST_SPREAD = 0.005
 _LEAST_MOTION = 0.003
 """RMS way across its main direction that a limb must move to show its plane [m]."""
 
-_SAME_INSTANT = 1_000_000
-"""Stamps that are nearer than this belong to one frame [ns]."""
+_TOGETHER = 0.75
+"""Share of the usual time between frames within which poses are of one frame."""
+_INTERVAL = 50_000_000
+"""Usual time from one pose of a body to its next before it is known [ns]."""
 _OPEN_FRAMES = 2
 """A body that is missing is waited for until so many later frames have begun."""
 _FROZEN_FRAMES = 3
-"""A body whose pose has been the very same for so many frames while others moved is lost."""
+"""A body whose pose has been the very same for so many frames is lost."""
+_FARTHEST = 1e6
+"""No body is that far away [m], whatever its unit is taken for."""
+_UPSIDE_DOWN = "the limb is upside down: check names and signs of fixed bodies, and rotations"
 _CLOCK_SET = 1_000_000_000
 """Stamps that go back by more than this are of a clock that was set [ns]."""
 
@@ -60,8 +66,10 @@ class PoseFrame(NamedTuple):
 class FrameAssembler:
     """Puts poses that come one body at a time together to frames.
 
-    A frame is complete when all bodies have come that came lately. Messages of one body keep their
-    order, those of different bodies may not: a few frames are open at a time.
+    Poses belong together whose stamps differ by less than the usual time between two poses of a
+    body, which may be stamped one by one. A frame is complete when all bodies have come that came
+    lately. Messages of one body keep their order, those of different bodies may not: a few frames
+    are open at a time.
 
     Args:
         bodies: the body map.
@@ -69,11 +77,17 @@ class FrameAssembler:
 
     def __init__(self, bodies: BodyMap) -> None:
         self._places = {name: place for place, name in enumerate(bodies.names)}
-        self._open: list[tuple[PoseFrame, set[int]]] = []
-        self._closed: int | None = None
+        self._frames: list[tuple[PoseFrame, set[int]]] = []
+        """The last one that was told, if any, and those that are open."""
+        self._told = 0
         self._expected = set(self._places.values())
+        self._last: dict[str, int] = {}
+        self._came: deque[int] = deque(maxlen=len(self._places))
+        self._intervals = deque([_INTERVAL], maxlen=50)
         self.unknown: dict[str, int] = {}
         """Poses of bodies that are not in the map, by name."""
+        self.astray: dict[str, float] = {}
+        """Bodies whose stamps are of another clock than the others', by how much [s]."""
 
     def take(self, name: str, stamp: int, pose: tuple[float, ...]) -> list[PoseFrame]:
         """Take x, y, z and the quaternion x, y, z, w of a body; return the frames that end so."""
@@ -81,32 +95,62 @@ class FrameAssembler:
         if place is None:
             self.unknown[name] = self.unknown.get(name, 0) + 1
             return []
-        if self._closed is not None and stamp <= self._closed + _SAME_INSTANT:
-            if stamp > self._closed - _CLOCK_SET:
-                # Of a frame that was told already: the next one waits for this body, too.
-                self._expected.add(place)
-                return []
-            self._open, self._closed = [], None
-        at = bisect.bisect(self._open, stamp - _SAME_INSTANT - 1, key=lambda each: each[0].stamp)
-        if at == len(self._open) or self._open[at][0].stamp > stamp + _SAME_INSTANT:
-            count = len(self._places)
-            frame = PoseFrame(stamp, np.full((count, 3), np.nan), np.full((count, 4), np.nan))
-            self._open.insert(at, (frame, set()))
-        frame, given = self._open[at]
+        if not self._is_of_this_clock(name, stamp):
+            return []
+        at = self._find(place, stamp)
+        if at < self._told:
+            # Of a frame that was told already: the next one waits for this body, too.
+            self._expected.add(place)
+            return []
+        frame, given = self._frames[at]
         frame.positions[place], frame.quaternions[place] = pose[:3], pose[3:]
         given.add(place)
         if given >= self._expected:
             # The bodies that an older one lacks have come with this one.
-            return self._close(at + 1)
-        if len(self._open) > _OPEN_FRAMES:
-            self._expected = set(self._open[0][1])
-            return self._close(1)
+            return self._tell(at + 1)
+        if len(self._frames) - self._told > _OPEN_FRAMES:
+            self._expected = set(self._frames[self._told][1])
+            return self._tell(self._told + 1)
         return []
 
-    def _close(self, count: int) -> list[PoseFrame]:
-        frames = [frame for frame, _ in self._open[:count]]
-        self._open, self._closed = self._open[count:], frames[-1].stamp
-        return frames
+    def _is_of_this_clock(self, name: str, stamp: int) -> bool:
+        """Tell whether a stamp is new and near those of the other bodies."""
+        interval = stamp - self._last.get(name, stamp - _INTERVAL)
+        self._last[name] = stamp
+        oldest = self._frames[0][0].stamp if self._frames else stamp
+        if max(interval, stamp - oldest) < -_CLOCK_SET:
+            self._frames, self._told = [], 0
+            self._came.clear()
+        self._came.append(stamp)
+        if 0 < interval < _CLOCK_SET:
+            self._intervals.append(interval)
+        apart = stamp - _median(self._came)
+        self.astray.pop(name, None)
+        if abs(apart) > (_OPEN_FRAMES + 0.5) * _median(self._intervals):
+            self.astray[name] = 1e-9 * apart
+        return name not in self.astray and interval != 0
+
+    def _find(self, place: int, stamp: int) -> int:
+        """Return which frame lacks a body that came, and is near enough; open one if none is."""
+        stamps = [frame.stamp for frame, _ in self._frames]
+        lacking = [at for at, (_, given) in enumerate(self._frames) if place not in given]
+        at = min(lacking, key=lambda at: abs(stamps[at] - stamp), default=-1)
+        if at < 0 or abs(stamps[at] - stamp) > _TOGETHER * _median(self._intervals):
+            at = bisect.bisect_left(stamps, stamp)
+            if at >= self._told:
+                count = len(self._places)
+                frame = PoseFrame(stamp, np.full((count, 3), np.nan), np.full((count, 4), np.nan))
+                self._frames.insert(at, (frame, set()))
+        return at
+
+    def _tell(self, end: int) -> list[PoseFrame]:
+        ended = [frame for frame, _ in self._frames[self._told : end]]
+        self._frames, self._told = self._frames[end - 1 :], 1
+        return ended
+
+
+def _median(values: deque[int]) -> int:
+    return sorted(values)[len(values) // 2]
 
 
 def fit_frame(points: Array, places: Array) -> tuple[BaseFrame, float] | None:
@@ -147,7 +191,7 @@ class BaseFinder:
         self._given = self.frame = bodies.frame
         self.residual = math.nan
         """RMS distance of the fixed bodies from where the map has them [m]."""
-        self.problem = "" if bodies.frame else "no fixed body has been seen yet"
+        self.problem = "" if bodies.frame else "no fixed body with a quaternion has been seen yet"
 
     def update(self, positions: Array, rotations: Array) -> BaseFrame | None:
         """Take one frame of all bodies and return the base to use for it, None without one.
@@ -278,12 +322,17 @@ class BodyTracker:
         stamp = frame.stamp * 1e-9
         positions = self.bodies.unit * frame.positions
         norms = np.linalg.norm(frame.quaternions, axis=1)
-        lost = ~(np.isfinite(positions).all(axis=1) & (np.abs(norms - 1.0) < 0.1))
-        lost |= self._frozen(frame)
+        told = (np.abs(positions) < _FARTHEST).all(axis=1) & (norms > 0.0) & (norms < np.inf)
+        # No pose of a limb is exactly zero: so some systems tell that they do not see a body.
+        told[self._index] &= positions[self._index].any(axis=1)
+        frozen, places = self._frozen(frame), np.full((len(self._index), 3), np.nan)
+        if frozen[told].all() and told[self._index].any():
+            paused = "the poses do not change at all: is their source paused?"
+            return BodyObservation(Followed(None, paused), places)
+        lost = frozen | ~told
         quaternions = np.where(lost[:, None], [0.0, 0.0, 0.0, 1.0], frame.quaternions)
         rotations = Rotation.from_quat(quaternions).as_matrix()
         positions[lost], rotations[lost] = np.nan, np.nan
-        places = np.full((len(self._index), 3), np.nan)
         base = self.base.update(positions, rotations)
         if base is None:
             return BodyObservation(Followed(None, f"no base: {self.base.problem}"), places)
@@ -293,6 +342,8 @@ class BodyTracker:
         places[:, :2] = points[:, :2]
         places[:, 2] = np.arctan2(axes[:, 1, 0], axes[:, 0, 0])
         seen = np.flatnonzero(np.isfinite(places).all(axis=1)).tolist()
+        if seen and np.median(axes[seen, 2, 2]) < -0.5:
+            return BodyObservation(Followed(None, _UPSIDE_DOWN), places)
         planar = []
         for k in seen:
             body = self.bodies.limb[k]
@@ -302,9 +353,8 @@ class BodyTracker:
         return BodyObservation(followed, places)
 
     def _frozen(self, frame: PoseFrame) -> NDArray[np.bool_]:
-        """Return which bodies keep their pose to the last digit while others move, (n,)."""
+        """Return which bodies keep their pose to the last digit, (n,)."""
         now = np.hstack([frame.positions, frame.quaternions])
         self._same = np.where((now == self._before).all(axis=1), self._same + 1, 0)
         self._before = now
-        frozen = self._same >= _FROZEN_FRAMES
-        return frozen if not frozen[np.isfinite(now).all(axis=1)].all() else np.zeros_like(frozen)
+        return np.asarray(self._same >= _FROZEN_FRAMES)

@@ -114,7 +114,8 @@ def calibrate_camera(
         if len(used) < LEAST_VIEWS:
             raise CalibrationError(
                 f"{len(used)} usable pictures of the board: take {LEAST_VIEWS} at least, better "
-                "20, tilted by 20 to 40 degrees in all directions and spread over the whole image"
+                "20, tilted by 20 to 40 degrees in all directions and spread over the whole image; "
+                "are they sharp, and is the board the one of --columns, --rows and --square?"
             )
         rms, matrix, distortion, tilts, sigma, errors = _solve(used, width, height, rational)
         worst = int(np.argmax(errors))

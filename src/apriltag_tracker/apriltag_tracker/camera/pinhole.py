@@ -90,7 +90,7 @@ class Intrinsics:
                 "the parameter calibration_file"
             )
         given = np.asarray(distortion, dtype=np.float64).reshape(-1)
-        if given.size > COEFFICIENTS or not np.all(np.isfinite(given)):
+        if given.size not in (0, 4, 5, COEFFICIENTS) or not np.all(np.isfinite(given)):
             raise CameraError(
                 f"{given.size} distortion coefficients: 0, 4, 5 or 8 finite ones expected"
             )
@@ -116,7 +116,7 @@ class Intrinsics:
             )
         except OSError as error:
             raise CameraError(f"cannot read the calibration {path}: {error.strerror}") from error
-        except (yaml.YAMLError, KeyError, TypeError) as error:
+        except (yaml.YAMLError, KeyError, TypeError, ValueError) as error:
             raise CameraError(
                 f"{path} is no camera_info YAML ({error}): scripts/calibrate_camera.py writes one"
             ) from error

@@ -1,5 +1,5 @@
 """Finds tags in an image: candidates, their corners, their codes, and following them over time."""
 
-from apriltag_tracker.detection.detector import Detector, Tag
+from apriltag_tracker.detection.detector import SMALLEST_TAG, Detector, Tag
 
-__all__ = ["Detector", "Tag"]
+__all__ = ["SMALLEST_TAG", "Detector", "Tag"]

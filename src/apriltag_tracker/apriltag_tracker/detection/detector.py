@@ -17,8 +17,8 @@ from apriltag_tracker.detection.codes import code_table, nearest_tag, read_codes
 from apriltag_tracker.detection.edges import refine_quads
 from apriltag_tracker.family import Family, FamilyError, named
 
-SMALLEST_TAG = 12.0
-"""A shorter side is not looked for [px]; a cell of such a tag is 1.5 px wide."""
+SMALLEST_TAG = 14.0
+"""A shorter side is not looked for [px]; a cell of such a tag is 1.75 px wide."""
 
 _SEARCH = 3.0
 """The sides of a tag may be this far from where it is expected [px]."""

@@ -15,6 +15,9 @@ from numpy.typing import NDArray
 from apriltag_tracker.pose.shape import FollowerOptions, LimbEstimate, PlanarTag, ShapeFitter
 from apriltag_tracker.tag_map import LimbGeometry
 
+_STRETCH = 0.5
+"""No soft limb is longer or shorter than at rest by more than this share."""
+
 
 class Followed(NamedTuple):
     """What one picture says about the limb.
@@ -86,6 +89,7 @@ class LimbFollower:
         stamp: float,
         common: NDArray[np.float64] | None = None,
         shared_noise: NDArray[np.float64] | None = None,
+        unfit: int = 0,
     ) -> Followed:
         """Take one picture.
 
@@ -94,17 +98,25 @@ class LimbFollower:
             stamp: of the picture [s].
             common: as of `ShapeFitter.fit`.
             shared_noise: as of `ShapeFitter.fit`.
+            unfit: how many more were seen that have not the size that the map says.
         """
         estimate = self._fitter.fit(seen, common, shared_noise) if seen else None
         if estimate is None:
-            return self._bridge(stamp, bool(seen))
+            cause = f"no limb {self._noun} {self._place}"
+            if seen:
+                cause = f"limb {self._noun}s contradict each other: check names, places, units"
+            elif unfit:
+                cause = f"{unfit} limb {self._noun}(s) do not fit the map: check size and height"
+            return self._bridge(stamp, cause)
         self.misplaced += len(estimate.rejected)
-        sigma = estimate.tip_sigma
+        problem, sigma = "", estimate.tip_sigma
         if sigma > self._options.largest_tip_sigma:
+            problem = f"the tip is known to {1e3 * sigma:.0f} mm only"
+        elif abs(estimate.elongation - 1.0) > _STRETCH:
+            problem = f"the limb has {estimate.elongation:.2f} of the map's length: check its units"
+        if problem:
             self._history.clear()
-            return Followed(
-                None, f"the tip is known to {1e3 * sigma:.0f} mm only; {self._remark(estimate)}"
-            )
+            return Followed(None, "; ".join(filter(None, (problem, self._remark(estimate)))))
         self._bridged = 0
         if self._history and stamp <= self._history[-1][0]:
             self._history.clear()
@@ -128,25 +140,31 @@ class LimbFollower:
             parts.append(f"without {self._noun} {', '.join(unseen)}")
         return "; ".join(parts)
 
-    def _bridge(self, stamp: float, inconsistent: bool) -> Followed:
-        """Continue the last motion for a few frames, with a covariance that grows."""
-        cause = (
-            f"what is seen of the limb contradicts itself: is each {self._noun} where the map says?"
-            if inconsistent
-            else f"no limb {self._noun} {self._place}"
-        )
+    def _bridge(self, stamp: float, cause: str) -> Followed:
+        """Continue the last motion for a few frames, while the tip is known well enough."""
         self._bridged += 1
-        if self._bridged > self._options.bridge_frames or len(self._history) < 2:
+        estimate = self._continued(stamp)
+        if estimate is None or estimate.tip_sigma > self._options.largest_tip_sigma:
             self._history.clear()
             self._fitter.reset()
             return Followed(None, cause)
+        frames = "frame" if self._bridged == 1 else "frames"
+        return Followed(estimate, f"bridged {self._bridged} {frames}: {cause}", bridged=True)
+
+    def _continued(self, stamp: float) -> LimbEstimate | None:
+        """Return where the last motion leads, with a covariance that grows."""
+        if self._bridged > self._options.bridge_frames or len(self._history) < 2:
+            return None
         (before, old), (last, new) = self._history
         share = (stamp - last) / (last - before)
+        # A pause is no motion: frames are counted by their usual time, too.
+        if not 0.0 < share < self._options.bridge_frames + 0.5:
+            return None
         going = ("tip", "tip_heading", "bend_angle", "curvature", "curve")
         gone = {name: share * (getattr(new, name) - getattr(old, name)) for name in going}
         # How wrong the continuation can be: as far as the limb went meanwhile, and a millimetre.
         growth = np.outer(gone["tip"], gone["tip"]) + 1e-6 * np.eye(2)
-        estimate = replace(
+        return replace(
             new,
             **{name: getattr(new, name) + way for name, way in gone.items()},
             tip_covariance=new.tip_covariance + growth,
@@ -154,5 +172,3 @@ class LimbFollower:
             tags_used=(),
             rejected={},
         )
-        frames = "frame" if self._bridged == 1 else "frames"
-        return Followed(estimate, f"bridged {self._bridged} {frames}: {cause}", bridged=True)

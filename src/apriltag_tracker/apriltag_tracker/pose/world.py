@@ -90,6 +90,9 @@ class WorldPose:
             self.bumps += 1
             self._seen.clear()
             self._frames = self._shifted = 0
+        if known and self._shifted:
+            self.problem = "the camera or the table is moving, or was just moved"
+            return None
         for tag in known:
             self._seen[tag.id].add(tag)
         if known and (self._frames < 10 or self._frames % _SOLVE_EVERY == 0):
@@ -128,11 +131,11 @@ class WorldPose:
             excluded[ids[worst]] = float(per_tag[worst])
             del ids[worst]
             start = None
-        if per_tag.max() > 4.0 * _MISFIT:
+        if per_tag.max() > 4.0 * _MISFIT or len(ids) < len(excluded):
             self.pose = None
             self.problem = (
-                f"the fixed tags {ids} do not fit together ({per_tag.max():.1f} px): survey their "
-                "positions again or calibrate the camera"
+                f"only {len(ids)} of {len(self._seen)} fixed tags fit together, {ids}, to "
+                f"{per_tag.max():.1f} px: survey positions and sizes again or calibrate the camera"
             )
             return
         self.pose, self.excluded, self.problem = pose, excluded, ""

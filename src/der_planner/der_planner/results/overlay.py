@@ -8,6 +8,7 @@ exactly.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -54,6 +55,10 @@ MINIMUM_TAGS = 20
 """Least number of seen limb tags that a projection is fitted to."""
 FITTED = 60.0
 """The projection is fitted to the tags of the first part of a run of this length [s]."""
+DELAYED = 5.0
+"""The delay of pictures is found in the first part of a run of this length [s]."""
+TOGETHER = 0.015
+"""A picture and a measured limb within this time are of one instant [s]: half a frame."""
 NEAR = 0.5
 """Messages within this time of an instant may belong to it [s]."""
 
@@ -125,6 +130,18 @@ class RunImages:
             type_name: _topics_of(bag, type_name, run.description.namespace)[:1]
             for type_name in (IMAGE_TYPE, CAMERA_TYPE, TAGS_TYPE, STATE_TYPE, MARKERS_TYPE)
         }
+        self._late = self._delay()
+
+    def _delay(self) -> int:
+        """Return by how much pictures are stamped later than their states, which are right [ns]."""
+        last = self._origin + round(DELAYED * NANOSECONDS)
+        images, states = (
+            [header_stamp(message) for _, _, message in self._bag.messages(topics, None, last)]
+            for topics in (self._topics[IMAGE_TYPE], self._topics[STATE_TYPE])
+        )
+        # The tracker takes the same time off every stamp.
+        gaps = Counter(image - state for image in images for state in states)
+        return max(gaps, key=lambda gap: (gaps[gap], -abs(gap)), default=0)
 
     def projection(self) -> Projection | None:
         """Fit the projection; None without a calibration or with too few tags."""
@@ -139,7 +156,8 @@ class RunImages:
                 if tag.on_limb and tag.pose_valid:
                     pixels.append(np.asarray(tag.corners).reshape(4, 2).mean(axis=0))
                     plane.append((tag.pose.x, tag.pose.y))
-        if info is None or len(pixels) < MINIMUM_TAGS:
+        # A camera that is not calibrated tells zeros.
+        if info is None or not np.any(info.k) or len(pixels) < MINIMUM_TAGS:
             return None
         camera, distortion = np.array(info.k).reshape(3, 3), np.array(info.d)
         normal = cv2.undistortPoints(np.array(pixels)[:, None, :], camera, distortion)[:, 0, :]
@@ -166,6 +184,7 @@ class RunImages:
     def _nearest(self, kind: str, time: float) -> Any:
         """Return the message of a type nearest to an instant; of markers, that of the limb."""
         when, near = self._origin + round(time * NANOSECONDS), round(NEAR * NANOSECONDS)
+        when += self._late * (kind == IMAGE_TYPE)
         read = self._bag.messages(self._topics[kind], when - near, when + near)
         found = [message for _, _, message in read]
         if kind == MARKERS_TYPE:
@@ -190,12 +209,17 @@ class RunImages:
             if marker.ns == LIMB_MARKER
         }
         for _, _, message in self._bag.messages(self._topics[IMAGE_TYPE]):
-            picture, stamp = gray(message), header_stamp(message)
+            picture, stamp = gray(message), header_stamp(message) - self._late
             if picture is not None:
-                near = min(limbs, key=lambda each: abs(each - stamp), default=0)
-                planned = limbs[near] if abs(near - stamp) < NEAR * NANOSECONDS else _NOTHING
                 time = (stamp - self._origin) / NANOSECONDS
-                yield time, Snapshot(picture, curves.get(stamp, _NOTHING), planned)
+                measured = _nearest_curve(curves, stamp, TOGETHER)
+                yield time, Snapshot(picture, measured, _nearest_curve(limbs, stamp, NEAR))
+
+
+def _nearest_curve(curves: dict[int, Array], stamp: int, within: float) -> Array:
+    """Return the curve nearest to a stamp [ns], an empty one if none is within some s."""
+    near = min(curves, key=lambda each: abs(each - stamp), default=0)
+    return curves[near] if abs(near - stamp) < within * NANOSECONDS else _NOTHING
 
 
 def _topics_of(bag: BagReader, type_name: str, namespace: str) -> list[str]:
@@ -352,15 +376,20 @@ def write_video(run: RunSeries, path: Path) -> Path:
 
 
 def _write_film(run: RunSeries, path: Path, frames: Frames) -> int:
-    """Write every frame; return how many."""
+    """Write the frames as fast as they were taken; return how many."""
     rate, count = 1.0 / float(np.median(np.diff(run.tip.time))), 0
     film = cv2.VideoWriter()
-    for _, frame in frames:
+    for time, frame in frames:
+        if not count:
+            begin, held = time, frame
         size = (frame.shape[1], frame.shape[0])
         if not count and not film.open(str(path), cv2.VideoWriter.fourcc(*"mp4v"), rate, size):
             raise EvaluationError(f"OpenCV cannot write the film {path}")
-        film.write(frame)
-        count += 1
+        # A picture stands until the next one where the camera misses some.
+        missed = max(round(rate * (time - begin)) - count, 0)
+        for each in (*[held] * missed, frame):
+            film.write(each)
+        count, held = count + missed + 1, frame
     film.release()
     return count
 
