@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urljoin
 
-from PIL import Image, ImageDraw
+from PIL import Image
 
 from benchmarks.page import PageGraph, page_graph
 from der_msgs.msg import PressureState
@@ -26,7 +26,6 @@ DESKTOP = {"width": 1280, "height": 800, "deviceScaleFactor": 1, "mobile": False
 TABLET = {"width": 820, "height": 1180, "deviceScaleFactor": 1, "mobile": True}
 TELEPHONE = {"width": 390, "height": 844, "deviceScaleFactor": 2, "mobile": True}
 SCREENS = {"desktop": DESKTOP, "tablet": TABLET, "phone": TELEPHONE}
-STATES = ("disarmed", "armed", "playing", "vented", "fault", "driver_dead", "page_dead")
 NO_DITHER = Image.Dither.NONE
 SETTLING = 1.5
 """[s] for a window to lay itself out in another size."""
@@ -89,28 +88,6 @@ def save(picture: Image.Image, file: Path) -> None:
     """Write a picture with few colours: the camera's noise makes it large otherwise."""
     few = picture.convert("RGB").quantize(256, Image.Quantize.FASTOCTREE, dither=NO_DITHER)
     few.save(file, optimize=True)
-
-
-def draw_sheet(folder: Path) -> None:
-    """Put the pictures of all states into one: desktop above, tablet and telephone below."""
-    cell, upper, lower, gap, per_row = 360, 225, 300, 8, 4
-    across, down = cell + 2 * gap, 24 + upper + lower + 3 * gap
-    rows = -(-len(STATES) // per_row)
-    sheet = Image.new("RGB", (per_row * across, rows * down), "white")
-    draw = ImageDraw.Draw(sheet)
-    for index, state in enumerate(STATES):
-        left, top = gap + index % per_row * across, index // per_row * down
-        draw.text((left, top), state.replace("_", " "), "black", font_size=16)
-        for name, x, y in (
-            ("desktop", 0, 0),
-            ("tablet", 0, upper + gap),
-            ("phone", 216, upper + gap),
-        ):
-            picture = Image.open(folder / f"page_{state}_{name}.png").convert("RGB")
-            picture.thumbnail((cell, upper if name == "desktop" else lower))
-            sheet.paste(picture, (left + x, top + 24 + y))
-    save(sheet, folder / "page_states.png")
-    print(folder / "page_states.png", flush=True)
 
 
 def draw_eight(photographer: Photographer) -> None:
@@ -186,7 +163,6 @@ def main() -> int:
         photographer = Photographer(graph, given.folder)
         if given.states:
             draw_states(photographer)
-            draw_sheet(given.folder)
             return 0
         press = photographer.press
         press("take")

@@ -158,7 +158,8 @@ class TagMap(LimbGeometry):
         count = self.family.tag_count
         if foreign := [tag for tag in self.ids if not 0 <= tag < count]:
             raise MapError(
-                f"tag ids {foreign} are none of 0 to {count - 1}, which {self.family.name} has"
+                f"tag ids {foreign} are none of 0 to {count - 1}, which {self.family.name} has: "
+                "take a tag map with ids of the family (--tag-map, parameter tag_map)"
             )
 
     @property

@@ -1,6 +1,6 @@
 """Save what can be read of bags that a kill, a crash, a full or a damaged disk left.
 
-python3 scripts/recover_bag.py out/bags/same_direction_der_1
+python3 scripts/recover_bag.py out/bags/same_direction_der_optimal_trial1
 python3 scripts/recover_bag.py run.mcap --out saved/run
 
 The bag itself stays as it is: its whole messages go into a new bag, BAG_recovered or that of --out.

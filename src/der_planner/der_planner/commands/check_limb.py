@@ -1,6 +1,6 @@
 """Say from later runs whether a limb file still fits, and bring it up to date.
 
-    python3 scripts/check_limb.py out/bags/same_direction_der_1 --limb my_limb.yaml
+    python3 scripts/check_limb.py out/bags/same_direction_der_optimal_trial1 --limb my_limb.yaml
     python3 scripts/check_limb.py log.csv --columns columns.yaml --limb my_limb.yaml
     python3 scripts/check_limb.py --update LATER_BAG --limb my_limb.yaml --out today.yaml
 

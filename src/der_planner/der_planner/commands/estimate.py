@@ -1,8 +1,9 @@
 """What a recorded run shows of the limb: its smoothed motion and what the model lacks, with doubts.
 
-    python3 scripts/estimate.py out/bags/same_direction_der_1 --limb out/limbs/seed_3.yaml
+    python3 scripts/estimate.py out/bags/same_direction_der_optimal_trial1 --limb FILE
 
-Any bag of a plan will do, played with feedback or without. The estimator of feedback goes over all
+FILE is the limb file that was planned with, of an experiment out/limbs/seed_1.yaml. Any bag of a
+plan will do, played with feedback or without. The estimator of feedback goes over all
 pictures and pressures of the run, forward and backward. The table (CSV) has a row every 50 ms: bend
 angles and rates, tip, and per segment the effective pressure that the model lacks and the relative
 error of its gain, each with its standard deviation. Exit code 0: written; 2: a file cannot be used.

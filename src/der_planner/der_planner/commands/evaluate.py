@@ -2,8 +2,11 @@
 
 python3 scripts/evaluate.py out/bags/*
 python3 scripts/evaluate.py out --report report           every bag of an experiment's folder
-python3 scripts/evaluate.py out/bags/same_direction_der_1 --video film.mp4
-python3 scripts/evaluate.py out/bags/same_direction_der_1 --contact --limb out/limbs/seed_3.yaml
+python3 scripts/evaluate.py out/bags/same_direction_der_optimal_trial1 --video film.mp4
+python3 scripts/evaluate.py out/bags/same_direction_der_optimal_trial1 --contact --limb FILE
+
+FILE is the limb file that was planned with, of an experiment out/limbs/seed_1.yaml. An experiment
+with --offline has no bags: its runs are in out/runs.
 
 A bag of several limbs gives a row for each: every limb is evaluated within its own namespace.
 """

@@ -2,7 +2,7 @@
 
 Example::
 
-    run = load_run("bags/same_direction_der_1")  # or RunSeries.from_arrays(…)
+    run = load_run("bags/same_direction_der_optimal_trial1")  # or RunSeries.from_arrays(…)
     result = evaluate_run(run)
     print(format_table(summarise([result])))
     write_results([result], folder)  # folder/results.json
