@@ -93,8 +93,8 @@ def test_a_body_that_stands_still_while_others_move_is_lost(bodies, swing):
 
 def test_poses_that_do_not_change_at_all_are_of_a_paused_source(bodies, swing):
     frame, tracker = SyntheticMocap(bodies, NOISE).frame(0, swing.shape(0.0)), BodyTracker(bodies)
-    found = [tracker.observe(frame._replace(stamp=k * 10**7)).followed for k in range(6)]
-    assert [each.estimate is None for each in found] == [False] * 3 + [True] * 3
+    found = [tracker.observe(frame._replace(stamp=k * 10**7)).followed for k in range(33)]
+    assert [each.estimate is None for each in found] == [False] * 30 + [True] * 3
     assert "is their source paused?" in found[-1].reason
 
 

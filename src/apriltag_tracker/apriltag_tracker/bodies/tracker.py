@@ -41,7 +41,9 @@ _INTERVAL = 50_000_000
 _OPEN_FRAMES = 2
 """A body that is missing is waited for until so many later frames have begun."""
 _FROZEN_FRAMES = 3
-"""A body whose pose has been the very same for so many frames is lost."""
+"""A body whose pose has been the very same for so many frames while others moved is lost."""
+_PAUSED_FRAMES = 30
+"""So many frames that are the very same are no measurements."""
 _FARTHEST = 1e6
 """No body is that far away [m], whatever its unit is taken for."""
 _UPSIDE_DOWN = "the limb is upside down: check names and signs of fixed bodies, and rotations"
@@ -327,8 +329,10 @@ class BodyTracker:
         told[self._index] &= positions[self._index].any(axis=1)
         frozen, places = self._frozen(frame), np.full((len(self._index), 3), np.nan)
         if frozen[told].all() and told[self._index].any():
-            paused = "the poses do not change at all: is their source paused?"
-            return BodyObservation(Followed(None, paused), places)
+            if self._same[told].min() >= _PAUSED_FRAMES:
+                paused = "the poses do not change at all: is their source paused?"
+                return BodyObservation(Followed(None, paused), places)
+            frozen[:] = False  # a limb at rest may be told by rounded numbers
         lost = frozen | ~told
         quaternions = np.where(lost[:, None], [0.0, 0.0, 0.0, 1.0], frame.quaternions)
         rotations = Rotation.from_quat(quaternions).as_matrix()
