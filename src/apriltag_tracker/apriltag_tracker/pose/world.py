@@ -26,6 +26,8 @@ _BUMP = 0.5
 """Shift of the fixed tags, all together, that means that the camera was moved [px]."""
 _BUMP_FRAMES = 3
 """Frames in a row that must show it."""
+_MOVING = 2.0
+"""Shift from which on a picture is of no use until the pose is found again [px]."""
 _MISFIT = 1.5
 """Residual at which a fixed tag does not fit the others [px]."""
 
@@ -72,7 +74,7 @@ class WorldPose:
         self._intrinsics = intrinsics
         self._seen: defaultdict[int, _Seen] = defaultdict(_Seen)
         self._frames = 0
-        self._shifted = 0
+        self._shift, self._shifted = 0.0, 0
         self.pose: CameraPose | None = None
         self.covariance = np.zeros((6, 6))
         """Of the pose: a rotation vector [rad] and a shift [m], both in the camera's frame."""
@@ -90,7 +92,8 @@ class WorldPose:
             self.bumps += 1
             self._seen.clear()
             self._frames = self._shifted = 0
-        if known and self._shifted:
+            self._shift = 0.0
+        if known and self._shift > _MOVING:
             self.problem = "the camera or the table is moving, or was just moved"
             return None
         for tag in known:
@@ -108,8 +111,8 @@ class WorldPose:
             return False
         gaps = np.array([tag.corners - self._seen[tag.id].corners for tag in averaged])
         shifts = sorted(np.hypot(*gaps.mean(axis=1).T).tolist())
-        typical = shifts[(len(shifts) - 1) // 2]
-        self._shifted = self._shifted + 1 if typical > _BUMP else 0
+        self._shift = shifts[(len(shifts) - 1) // 2]
+        self._shifted = self._shifted + 1 if self._shift > _BUMP else 0
         return self._shifted >= _BUMP_FRAMES
 
     def _solve(self) -> None:
