@@ -1,11 +1,19 @@
-"""Files that are there whole or not at all, and files of YAML that are read or refused by name."""
+"""Files that are there whole or not at all; YAML, written, and read or refused by name."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
+
+
+class _Dumper(yaml.SafeDumper):
+    """Writes numbers of numpy as numbers."""
+
+
+_Dumper.add_multi_representer(np.floating, lambda dumper, n: dumper.represent_float(float(n)))
 
 
 def write_whole(path: str | Path, text: str) -> None:
@@ -21,6 +29,12 @@ def write_whole(path: str | Path, text: str) -> None:
     unfinished = file.with_name(f".{file.name}.part")
     unfinished.write_text(text, encoding="utf-8")
     unfinished.replace(file)
+
+
+def yaml_text(content: Any, **style: Any) -> str:
+    """Return content as YAML, keys in their order; ``style`` is that of `yaml.dump`."""
+    text: str = yaml.dump(content, Dumper=_Dumper, sort_keys=False, **style)
+    return text
 
 
 def read_yaml(

@@ -14,12 +14,14 @@ from der_planner.planning.plan_file import learned_plan, read_plan, write_plan
 
 @pytest.fixture(scope="module")
 def bent():
-    """Return a plan of a limb that rests bent, which begins where another motion is left."""
+    """Return a plan of a limb that rests bent, which begins where another motion is left.
+
+    One of its numbers was computed by numpy.
+    """
     motion = Motion.named("asynchronous", amplitude=0.3, period=3.0, cycles=1)
     start = Start(np.array([0.1, 0.05]), np.zeros(2), np.zeros(2), np.array([500.0, 100.0]))
-    return plan(
-        with_segments(Limb.default(), rest_curvature=0.3), motion, method="projected", start=start
-    )
+    limb = with_segments(Limb.default(), rest_curvature=np.float64(0.3))
+    return plan(limb, motion, method="projected", start=start)
 
 
 def test_a_plan_is_read_back_whole(bent, tmp_path):

@@ -370,7 +370,7 @@ class Learner:
         Noise is what runs of one plan differ by. Where none was repeated, a limb whose friction
         answers small changes otherwise than its model looks noisy, too, and gets worse run by run.
         """
-        showed, best = self._runs.shown(run), self._runs.shown(before)
+        showed, best = self._runs.missed(run), self._runs.missed(before)
         return not self._runs.repeated and showed > _SHOWN_WORSE * best
 
     def _reason_to_stop(self) -> str:

@@ -15,6 +15,7 @@ pair counts as that of a few independent numbers only.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -132,13 +133,18 @@ class Runs:
     def __init__(self, reference: Array, period: float, tip_per_pressure: float) -> None:
         self._reference, self._period, self._tip_per_pressure = reference, period, tip_per_pressure
         self._all: list[PlayedRun] = []
-        self.repeats, self.repeated = Repeatability(), False
+        self.repeats = Repeatability()
 
     def add(self, run: PlayedRun) -> None:
-        """Take in a run; `repeated` tells whether two were of one plan, which alone show N."""
-        self.repeated |= self.expected(run.commands) is not None
+        """Take in a run."""
         self._all.append(run)
         self.repeats = estimate(self._pairs())
+
+    @property
+    def repeated(self) -> bool:
+        """Whether two runs were of one plan, which alone show N."""
+        pairs = itertools.combinations(self._all, 2)
+        return any(np.array_equal(one.commands, other.commands) for one, other in pairs)
 
     def expected(self, commands: Array) -> Expected | None:
         """Return what the model expects under commands that were played; None: never played."""
@@ -171,8 +177,8 @@ class Runs:
         """Return the mean distance from r̄ that all runs say the commands of one leave [m]."""
         return float(np.linalg.norm(self.error(run), axis=1).mean())
 
-    def shown(self, run: PlayedRun) -> float:
-        """Return the mean distance from r̄ that a run itself showed [m]."""
+    def missed(self, run: PlayedRun) -> float:
+        """Return the mean distance from r̄ that a run by itself showed [m]."""
         left = (run.expected.tip + run.shown.value - self._reference)[run.shown.seen]
         return float(np.linalg.norm(left, axis=1).mean())
 

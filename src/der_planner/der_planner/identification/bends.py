@@ -8,10 +8,9 @@ go of what friction held, which would pass for creep and for a spring that softe
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Callable, Sequence
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import compress
 
 import numpy as np
@@ -202,7 +201,7 @@ class BendFit:
     ) -> None:
         self.free, self._model, self._logs, self._more_rows = free, model, logs, more_rows
         # A search comes back to its best values after steps that led to nothing better.
-        self._kept = functools.lru_cache(maxsize=8)(self._predict)
+        self._kept = lru_cache(maxsize=8)(self._predict)
         self._bends_on = [_bends_on(free.limb, log) for log in logs]
         self._shaken = [_shaken(free.limb, log) for log in logs]
         self.weigh(np.full((3, free.limb.segment_count), ANGLE_ERROR))

@@ -186,7 +186,7 @@ class UnevenTips:
         self._spanned = np.linalg.qr(by_lengths)[0]
 
     def rows(self, found: Predicted) -> Rows:
-        """Return the weighted residual of a prediction."""
+        """Return the weighted residual of a prediction, and what gives its derivatives."""
         rows = self._seen
         uneven = (found.tip - self._even.tip(found.angles))[rows] - self._uneven
 

@@ -17,10 +17,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
-from der_planner.files import read_yaml, write_whole
+from der_planner.files import read_yaml, write_whole, yaml_text
 from der_planner.limb.declaration import (
     LimbError,
     Parameter,
@@ -341,16 +340,9 @@ class Limb:
 
     def to_yaml(self, path: str | Path) -> None:
         """Write a limb file that `from_yaml` reads back as an equal limb, whole or not at all."""
-        text = yaml.dump(self.to_mapping(), Dumper=_Dumper, sort_keys=False, allow_unicode=True)
+        text = yaml_text(self.to_mapping(), allow_unicode=True)
         head = "# A limb, in SI units. How to choose each: the site, python3 scripts/docs.py\n"
         write_whole(path, head + commented(text, sections()))
-
-
-class _Dumper(yaml.SafeDumper):
-    """Writes numbers of numpy as numbers."""
-
-
-_Dumper.add_multi_representer(np.floating, lambda dumper, n: dumper.represent_float(float(n)))
 
 
 def sections() -> dict[str, dict[str, Parameter]]:

@@ -17,7 +17,7 @@ import numpy as np
 import yaml
 
 from der_planner.arrays import Array
-from der_planner.files import read_yaml, write_whole
+from der_planner.files import read_yaml, write_whole, yaml_text
 from der_planner.limb import Limb, LimbError
 from der_planner.model import CONTROL_PERIOD, NODES, Model
 from der_planner.model.commands import within_limits
@@ -146,7 +146,7 @@ def write_plan(plan: Plan, path: str | Path, about: Mapping[str, Any] | None = N
     if plan.chambers_beyond is not None:
         content["chambers_beyond_pa"] = plan.chambers_beyond.tolist()
     text = "# A plan, in SI units; row by row the setpoints, 50 ms apart.\n"
-    text += yaml.safe_dump(content, sort_keys=False, default_flow_style=None)
+    text += yaml_text(content, default_flow_style=None)
     write_whole(path, text)
 
 
