@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property, lru_cache
 from itertools import compress
 
@@ -129,17 +130,24 @@ class Predicted:
             change /= gain[:, None] * _NUDGE * scale[driven]
             moved = self._response.derivative.by_effective(change)
             tip_by[:, :, driven], angles_by[:, :, driven] = moved
-        for place in np.flatnonzero(np.logical_not(self._driven)):
-            step = np.zeros(count)
-            step[place] = _STEP * scale[place]
-            try:
-                other = self._at(step)
-            except RuntimeError:  # beyond what the model can follow
-                step = -step
-                other = self._at(step)
-            tip_by[:, :, place] = (other.tip - self.tip) / step[place]
-            angles_by[:, :, place] = (other.bend_angles - self.angles) / step[place]
+        moving = np.flatnonzero(np.logical_not(self._driven))
+        with ThreadPoolExecutor() as threads:  # the kernels hold no lock
+            found = threads.map(self._difference, moving)
+            for place, (angles, tip) in zip(moving, found, strict=True):
+                angles_by[:, :, place], tip_by[:, :, place] = angles, tip
         return angles_by, tip_by
+
+    def _difference(self, place: int) -> tuple[Array, Array]:
+        """Return the derivatives (K, M) and (K, 2) by one unknown, from another simulation."""
+        step = np.zeros(len(self._values))
+        step[place] = _STEP * self._free.unknowns.scale[place]
+        try:
+            other = self._at(step)
+        except RuntimeError:  # beyond what the model can follow
+            step = -step
+            other = self._at(step)
+        length = step[place]
+        return (other.bend_angles - self.angles) / length, (other.tip - self.tip) / length
 
     def _at(self, step: Array) -> Response | Rollout:
         limb, response = self._free.limb_with(self._values + step), self._response
