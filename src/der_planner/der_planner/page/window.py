@@ -32,7 +32,7 @@ SOURCES = {
 OBSTACLES = {
     "disarmed": "the limb is disarmed: arm first",
     "fault": "the limb was vented after a fault: remove the cause, then arm",
-    SILENT: "the driver is silent: see the alarm",
+    SILENT: "the driver is not heard any more",
 }
 """Why nothing is played in a mode of the driver."""
 CURVES = {
