@@ -67,6 +67,7 @@ class Situation:
     def __init__(
         self, clock: Callable[[], float] = time.monotonic, namespace: str = "/limb"
     ) -> None:
+        self.namespace = namespace
         self._own = {f"{namespace}/{name}": name for name in NODES}
         self._clock = clock
         self._last_words: dict[str, str] = {}
