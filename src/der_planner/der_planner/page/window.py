@@ -31,7 +31,7 @@ SOURCES = {
 """What the one play button plays."""
 OBSTACLES = {
     "disarmed": "the limb is disarmed: arm first",
-    "fault": "the limb was vented after a fault: remove the cause, then arm",
+    "fault": "the driver is in fault: remove the cause, then arm",
     SILENT: "the driver is not heard any more",
 }
 """Why nothing is played in a mode of the driver."""
@@ -186,17 +186,14 @@ class OperatorWindow:
             self._show("play", await self._parts.commands.call("start"))
             return
         try:
-            command = self._command()
+            if self._source.value == DRAWING:
+                command = self._drawing.command()
+            else:
+                command = self._form.command(learned=self._source.value == LEARNED_PLAN)
         except FormError as error:
             ui.notify(str(error), type="negative")
             return
         self._show("play", await self._parts.commands.play(command))
-
-    def _command(self) -> MotionCommand:
-        """Return the command of the chosen source; raises `FormError` where there is none."""
-        if self._source.value == DRAWING:
-            return self._drawing.command()
-        return self._form.command(learned=self._source.value == LEARNED_PLAN)
 
     def _show(self, what: str, answer: Answer) -> None:
         show_answer(self._client, Answer(answer.success, f"{what}: {answer.message}"))
