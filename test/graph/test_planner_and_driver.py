@@ -74,7 +74,7 @@ def test_a_driver_that_vents_hangs_or_dies_is_sent_nothing_more(rig):
     assert "plan old vented after" in rig.planner.log.read_text()
     assert rig.nothing_more_comes()
     rig.arm()
-    rig.wait(lambda: rig.said("driver") == "ARMED", "the planner to hear of it")
+    rig.wait(lambda: rig.said("state") == "idle", "the planner to hear of it")
     begin = len(rig.states)
     assert rig.nothing_more_comes()
     assert max(abs(u) for s in rig.states[begin:] for u in s.commanded_differential) == 0.0

@@ -199,3 +199,5 @@ def test_what_is_missing_of_a_graph_is_named_with_the_command(situation: Situati
     assert [line.split()[-1] for line in starts] == [
         "pressure_driver", "apriltag_tracker", "recorder",
     ]  # fmt: skip
+    situation.put_status(status("/limb/experiment"))  # which starts the others
+    assert situation.snapshot()["missing"] == []

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import re
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from nicegui import Client
+from nicegui.page import page
 
+from der_msgs.msg import MotionCommand
 from der_planner.limb import Limb, LimbError, Load
 from der_planner.model import ArcModel
 from der_planner.page.drawing import (
@@ -20,7 +26,7 @@ from der_planner.page.drawing import (
     preview,
     reachable_region,
 )
-from der_planner.page.drawing_panel import summary
+from der_planner.page.drawing_panel import DrawingPanel, summary
 from der_planner.planning import PathLimits, Workspace, planner
 
 LIMB = Limb.default()
@@ -120,3 +126,21 @@ def test_files_put_there_by_hand_are_found_and_missing_ones_named(tmp_path: Path
         drawings.load("none")
     with pytest.raises(DrawingError):
         drawings.save("..", np.zeros((2, 2)))
+
+
+@pytest.mark.parametrize("sent", [[[1.0, 2.0]], [], [[1.0, 2.0], [3.0, 4.0]]])
+def test_a_drawing_that_has_left_the_picture_is_not_played(
+    sent: list[list[float]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After a tap, a line that was broken off, and one where the camera's pose is not known."""
+    monkeypatch.setattr(Client, "run_javascript", lambda *_: None)
+    parts: Any = SimpleNamespace(
+        drawings=DrawingFolder(Path("nowhere")), overlay=SimpleNamespace(on_plane=lambda _: None)
+    )
+    drawn: Any = SimpleNamespace(args={"points": sent})
+    with Client(page("/")) as client:
+        panel = DrawingPanel(client, parts, MotionCommand, lambda: None)
+        panel._switch.value, panel._playable = True, MotionCommand()
+        assert panel.ready
+        asyncio.run(panel._on_drawn(drawn))
+        assert not panel.ready

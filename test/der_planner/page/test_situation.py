@@ -20,11 +20,11 @@ from der_planner.page.situation import DEAD, FORGOTTEN, FRESH, LATE, SILENT, Sit
 from limb_interfaces.stamps import stamp_from_nanoseconds
 
 
-def driver(mode: int = 5) -> PressureState:
+def driver(mode: int = 5, age: float = 0.1) -> PressureState:
     nan = float("nan")
     return PressureState(
         mode=mode, faults=["no telemetry"], commanded_differential=[12_000.0, 0.0],
-        measured_differential=[nan, 250.0], supply_pressure=nan, telemetry_age=nan,
+        measured_differential=[nan, 250.0], supply_pressure=nan, telemetry_age=age,
     )  # fmt: skip
 
 
@@ -60,6 +60,10 @@ def test_numbers_come_in_kilopascal_and_unknown_ones_as_null(situation: Situatio
     assert values["commanded_kpa"] == [12.0, 0.0]
     assert values["measured_kpa"] == [None, 0.25]
     assert values["supply_kpa"] is None
+    for silent in (0.6, math.nan):  # the board's last readings are none of now
+        situation.put_driver(driver(age=silent))
+        assert situation.snapshot()["driver"]["measured_kpa"] == [None, None]
+        assert situation.snapshot()["limb_is"].startswith("under pressure")  # it was told so
     situation.put_driver(driver(mode=17))
     assert situation.snapshot()["driver"]["mode"] == "unknown mode 17"
 

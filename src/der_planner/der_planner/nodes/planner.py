@@ -81,6 +81,8 @@ class PlannerNode(Node):
         if ending is not None:
             self._streamer.abandon(ending)
             self._drop_request(ending, nanoseconds(message.header.stamp))
+        elif message.mode == message.ARMED and self._status.state in ("vented", "fault", "lost"):
+            self._status = Status("idle", self._status.plan_id)  # what ended the plan is over
         self._corrector.add_pressures(message)
 
     def _on_limb(self, message: LimbState) -> None:

@@ -179,7 +179,7 @@ def _points(places: Array | Sequence[Array]) -> list[Point]:
 
 _LEVELS = {
     "starting": "stale",
-    **dict.fromkeys(("error", "failed", "fault", "lost"), "error"),
+    **dict.fromkeys(("error", "fault", "lost"), "error"),
     **dict.fromkeys(("refused", "vented"), "warning"),
 }
 """Levels of the diagnostics in states that say it all."""

@@ -95,11 +95,11 @@ class DrawingPanel:
         sent = event.args.get("points") if isinstance(event.args, dict) else None
         try:
             tip = self._parts.overlay.on_plane(drawn_pixels(sent))
+            if tip is None:
+                raise DrawingError("the camera's pose is not known yet: are the fixed tags seen?")
         except DrawingError as error:
+            self._clear()  # the window shows the drawing before it no more
             self._result.set_text(str(error))
-            return
-        if tip is None:
-            self._result.set_text("The camera's pose is not known yet: are the fixed tags seen?")
             return
         await self._plan(tip)
 

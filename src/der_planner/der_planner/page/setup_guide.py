@@ -245,7 +245,7 @@ def add_setup_guide(parts: Parts) -> None:
         add_frame(client)
         guide = SetupGuide(parts.previewer.limb.segment_count)
         with ui.element("main").props('id="setup"') as main:
-            ui.html("<h2>First power-up</h2>", sanitize=False)
+            ui.html(f"<h2>First power-up of {parts.situation.namespace}</h2>", sanitize=False)
             ui.label("From top to bottom; every step is checked twice a second.")
             shown: list[tuple[ui.step, ui.label]] = []
 

@@ -67,6 +67,7 @@ class Situation:
     def __init__(
         self, clock: Callable[[], float] = time.monotonic, namespace: str = "/limb"
     ) -> None:
+        self.namespace = namespace
         self._own = {f"{namespace}/{name}": name for name in NODES}
         self._clock = clock
         self._last_words: dict[str, str] = {}
@@ -92,13 +93,16 @@ class Situation:
         """Take the driver's state."""
         known = dict(enumerate(MODES.items()))
         mode, meaning = known.get(message.mode, (f"unknown mode {message.mode}", "unknown"))
+        measured = message.measured_differential
+        if not message.telemetry_age <= FRESH["driver"]:  # the board's last ones, maybe of long ago
+            measured = [math.nan] * len(measured)
         values = {
             "mode": mode,
             "meaning": meaning,
             "faults": list(message.faults),
             "plan_id": message.plan_id,
             "commanded_kpa": _kilopascal(message.commanded_differential),
-            "measured_kpa": _kilopascal(message.measured_differential),
+            "measured_kpa": _kilopascal(measured),
             "supply_kpa": _number(message.supply_pressure / PASCAL_PER_KILOPASCAL, 1),
             "telemetry_age": _number(message.telemetry_age, 2),
         }

@@ -31,8 +31,8 @@ SOURCES = {
 """What the one play button plays."""
 OBSTACLES = {
     "disarmed": "the limb is disarmed: arm first",
-    "fault": "the limb was vented after a fault: remove the cause, then arm",
-    SILENT: "the driver is silent: see the alarm",
+    "fault": "the driver is in fault: remove the cause, then arm",
+    SILENT: "the driver is not heard any more",
 }
 """Why nothing is played in a mode of the driver."""
 CURVES = {
@@ -48,7 +48,7 @@ COLOURS = ("#2367c9", "#d2601a", "#3c8a3c", "#8a3c8a")
 def lay_out(app: FastAPI, parts: Parts) -> None:
     """Add the page at `/`, and the set-up guide, to the application."""
 
-    @ui.page("/", title="Limb", favicon="🦑", reconnect_timeout=RECONNECT)
+    @ui.page("/", title=parts.situation.namespace, favicon="🦑", reconnect_timeout=RECONNECT)
     def index(client: Client) -> None:
         OperatorWindow(client, parts)
 
@@ -137,7 +137,7 @@ class OperatorWindow:
         return ""
 
     def _show_desk(self) -> None:
-        desk = self._parts.desk
+        desk, limb = self._parts.desk, self._parts.situation.namespace
         mine = desk.may_command(self._client.id)
         for name, (around, button) in self._buttons.items():
             reason = self._obstacle(name)
@@ -150,11 +150,11 @@ class OperatorWindow:
         self._take.set_text("Give up control" if mine else "Take control")
         self._take.set_enabled(mine or desk.operator is None)
         if mine:
-            self._who.set_text("You command.")
+            self._who.set_text(f"You command {limb}.")
         elif desk.operator is None:
-            self._who.set_text("Nobody commands: take control first. Vent always works.")
+            self._who.set_text(f"Nobody commands {limb}: take control first. Vent always works.")
         else:
-            self._who.set_text("Another window commands; you watch. Vent always works.")
+            self._who.set_text(f"Another window commands {limb}; you watch. Vent always works.")
 
     def _on_take(self) -> None:
         desk = self._parts.desk
@@ -186,17 +186,14 @@ class OperatorWindow:
             self._show("play", await self._parts.commands.call("start"))
             return
         try:
-            command = self._command()
+            if self._source.value == DRAWING:
+                command = self._drawing.command()
+            else:
+                command = self._form.command(learned=self._source.value == LEARNED_PLAN)
         except FormError as error:
             ui.notify(str(error), type="negative")
             return
         self._show("play", await self._parts.commands.play(command))
-
-    def _command(self) -> MotionCommand:
-        """Return the command of the chosen source; raises `FormError` where there is none."""
-        if self._source.value == DRAWING:
-            return self._drawing.command()
-        return self._form.command(learned=self._source.value == LEARNED_PLAN)
 
     def _show(self, what: str, answer: Answer) -> None:
         show_answer(self._client, Answer(answer.success, f"{what}: {answer.message}"))

@@ -27,7 +27,7 @@
     return {
       level: "danger",
       text: `No connection to the page's server for ${ago(silence)}: nothing below is live. ${limb}`,
-      advice: "VENT may not reach it from here: close the valve at the air supply",
+      advice: "VENT may not reach it from here: close the valve at the air supply; if the page was started again, open the address that it prints",
     };
   }
 
@@ -57,7 +57,7 @@
     put(find("meaning"), meaning);
     put(find("figures"), known ? figures(driver) : "");
     const failed = find("vent-notice"); // of a vent that the limb has taken after all
-    const vented = known && driver.mode === "disarmed" && page.data.limb_is === "without pressure";
+    const vented = known && ["disarmed", "fault"].includes(driver.mode) && page.data.limb_is === "without pressure";
     if (vented && failed.className === "danger") failed.hidden = true;
   }
 

@@ -70,7 +70,7 @@ page.drawing = (() => {
   function end(event) {
     if (event.pointerId !== pointer) return;
     pointer = null;
-    if (event.type !== "pointerup") { points = []; return; }
+    if (event.type !== "pointerup") points = [];
     // Tenths of a pixel of the camera's picture are finer than any hand.
     const rounded = points.map((point) => point.map((value) => Math.round(value * 10) / 10));
     emitEvent("drawn", { points: rounded });

@@ -16,7 +16,7 @@
       press.timeStamp + CONFIRMED - performance.now());
     try {
       const answer = await fetch("/vent", { method: "POST", signal: AbortSignal.timeout(4000) });
-      const result = answer.ok ? await answer.json() : { message: await answer.text() };
+      const result = answer.ok ? await answer.json() : { message: `NOT VENTED; close the valve at the air supply: ${await answer.text()}` };
       good = result.success === true;
       text = `${good ? "Vented" : "VENT FAILED"}: ${result.message}`;
     } catch (error) {
