@@ -1,5 +1,7 @@
 """A lab's own driver of valves as a board: numbers and order of its topics, and what is watched."""
 
+import math
+
 import pytest
 
 from pressure_driver.emulator.firmware import NativeBoard
@@ -41,6 +43,17 @@ def test_the_topics_have_their_own_unit_zero_and_order():
 def test_an_order_that_does_not_name_every_chamber_is_refused(order):
     with pytest.raises(SettingError, match="'order'"):
         Scale(TopicBoardSettings(order=order))
+
+
+@pytest.mark.parametrize("told", [(0.0, 0.0, 0.0), (0.0, 0.0, 0.0, math.nan)])
+def test_readings_that_are_not_a_number_for_each_chamber_are_refused(told):
+    with pytest.raises(ValueError, match="4 numbers are expected"):
+        Scale(TopicBoardSettings()).from_topic(told)
+
+
+def test_one_topic_for_the_pressures_of_each_chamber_is_refused():
+    with pytest.raises(SettingError, match="'measured_topic'"):
+        TopicBoardSettings(message="FluidPressure", command_topic="/valve{}/command")
 
 
 def test_setpoints_are_passed_on_and_readings_come_back():

@@ -38,7 +38,14 @@ class Scale:
         return [(gauge[k] + self._room) * self._scale + self._offset for k in self._order]
 
     def from_topic(self, told: Sequence[float]) -> list[float]:
-        """Return gauge pressures (2M,) [Pa] for what a lab tells, in its order."""
+        """Return gauge pressures (2M,) [Pa] for what a lab tells, in its order.
+
+        Raises:
+            ValueError: it does not tell one number for each chamber.
+        """
+        if len(told) != len(self._order) or not all(map(math.isfinite, told)):
+            listed = ", ".join(f"{value:g}" for value in told)
+            raise ValueError(f"measured is {listed}: {len(self._order)} numbers are expected")
         gauge = [(value - self._offset) / self._scale - self._room for value in told]
         return [gauge[self._order.index(chamber)] for chamber in range(len(gauge))]
 
@@ -65,6 +72,10 @@ class WatchedBoard:
         self._valid_until = math.inf
         self._measured_at = -math.inf
 
+    def hears(self, now: float) -> bool:
+        """Tell whether pressures have been measured just now (steady clock [s])."""
+        return now - self._measured_at < STALE
+
     def receive(self, data: bytes, now: float) -> bytes:
         """Execute the commands of the driver; return the answers (steady clock [s])."""
         answers = b""
@@ -77,8 +88,7 @@ class WatchedBoard:
                 )
                 self._regulate(command.pressure or self._zero)
             # An answer holds readings: old ones would pass for new ones.
-            fresh = now - self._measured_at < STALE
-            if fresh or command.kind in ("hello", "refused"):
+            if self.hears(now) or command.kind in ("hello", "refused"):
                 answers += self._firmware.reply(command, replace(self._reading, time=now))
         return answers
 
