@@ -237,12 +237,12 @@ class BoardProcess:
         if self._line is not None or time.monotonic() < self._retry_at:
             return
         if may_open(self._port):
-            self._retry_at = time.monotonic() + RETRY_TIME
             with contextlib.suppress(OSError, ValueError):
                 self._line = open_line(self._port, self._baud_rate)
                 self._reconnects += 1
                 self._log(f"{self._port} is back", True)
                 self._opened()
+            self._retry_at = time.monotonic() + RETRY_TIME
 
     def _watch_queue(self) -> None:
         """Lose the port if what has been written stays where it is: the board does not read."""

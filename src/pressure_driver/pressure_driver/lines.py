@@ -29,8 +29,8 @@ VENT_TIME = 1.0
 """[s] for which one process of the driver vents in the place of the other."""
 VENT_PERIOD = 0.05
 """[s] between two vent commands of a process that vents in the place of another."""
-CONNECT_TIME = 0.1
-"""[s] for a connection: a board in the same room answers in 0.001 s, and meanwhile nothing runs."""
+CONNECT_TIME = 0.4
+"""[s] for a connection: over WLAN some take 0.2 s, and meanwhile nothing runs."""
 LONGEST_LOOK = 20_000_000
 """[ns] between two looks for a host that wants a connection."""
 ADVICE = "close the air supply"
