@@ -155,12 +155,10 @@ def test_a_lab_s_own_driver_is_played_and_vented_when_this_one_dies(graph):
     )
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = f"tcp://127.0.0.1:{free.getsockname()[1]}"
-    lab = {"scale": 0.001, "order": "2,3,0,1"}
-    board = graph.start("pressure_driver", "topic_board", listen=port, **lab)
+    board = graph.start("pressure_driver", "topic_board", listen=port, scale=0.001)
     client.wait_ready(["topic_board"])
-    driver = graph.start(
-        "pressure_driver", "pressure_driver", port=port, protocol="native", supply_required=False
-    )
+    lab = {"protocol": "native", "supply_required": False, "wiring": "3,4,1,2"}
+    driver = graph.start("pressure_driver", "pressure_driver", port=port, **lab)
     client.watch([board, driver])
     client.wait_ready(["pressure_driver"])
 

@@ -219,7 +219,6 @@ class TopicBoardSettings:
     scale: float = _number(1.0, "1/Pa", 1e-9, 1e9, "of the topics: 0.001 where they are in kPa")
     offset: float = _number(0.0, "", -1e9, 1e9, "added to scaled pressures")
     absolute: bool = _other(False, "the topics have absolute pressures")
-    order: str = _other("0,1,2,3", "the chamber at each place of the topics")
     atmosphere: float = _number(101_325.0, "Pa", 5e4, 1.1e5, "of the room")
     segment_count: int = _number(2, "", 1, 16, "pairs of chambers")
     largest_pressure: float = _number(30_000.0, "Pa", 0.0, 1e6, "gauge, that the valves take")

@@ -8,7 +8,6 @@ from dataclasses import replace
 
 from pressure_driver.emulator import BoardReading
 from pressure_driver.emulator.firmware import NativeBoard
-from pressure_driver.protocols import order_of
 from pressure_driver.settings import TopicBoardSettings
 
 STALE = 0.2
@@ -20,34 +19,28 @@ class Scale:
 
     Args:
         settings: `scale` is what one Pa is on the topic, `offset` what is added to that; with
-            `absolute` the room's pressure is part of it. `order` names, for each place of the
-            lab's array, the chamber that stands there.
-
-    Raises:
-        SettingError: the order does not name every chamber once.
+            `absolute` the room's pressure is part of it.
     """
 
     def __init__(self, settings: TopicBoardSettings) -> None:
-        count = 2 * settings.segment_count
-        self._order = order_of(settings.order, count, first=0, name="order")
+        self._count = 2 * settings.segment_count
         self._scale, self._offset = settings.scale, settings.offset
         self._room = settings.atmosphere if settings.absolute else 0.0
 
     def to_topic(self, gauge: Sequence[float]) -> list[float]:
-        """Return what a lab is told, in its order, for gauge pressures (2M,) [Pa]."""
-        return [(gauge[k] + self._room) * self._scale + self._offset for k in self._order]
+        """Return what a lab is told for gauge pressures (2M,) [Pa]."""
+        return [(value + self._room) * self._scale + self._offset for value in gauge]
 
     def from_topic(self, told: Sequence[float]) -> list[float]:
-        """Return gauge pressures (2M,) [Pa] for what a lab tells, in its order.
+        """Return gauge pressures (2M,) [Pa] for what a lab tells.
 
         Raises:
             ValueError: it does not tell one number for each chamber.
         """
-        if len(told) != len(self._order) or not all(map(math.isfinite, told)):
+        if len(told) != self._count or not all(map(math.isfinite, told)):
             listed = ", ".join(f"{value:g}" for value in told)
-            raise ValueError(f"measured is {listed}: {len(self._order)} numbers are expected")
-        gauge = [(value - self._offset) / self._scale - self._room for value in told]
-        return [gauge[self._order.index(chamber)] for chamber in range(len(gauge))]
+            raise ValueError(f"measured is {listed}: {self._count} numbers are expected")
+        return [(value - self._offset) / self._scale - self._room for value in told]
 
 
 class WatchedBoard:
