@@ -243,7 +243,8 @@ def vent_line(descriptor: int, command: bytes, duration: float) -> str:
                 taken = False
                 _flush(descriptor)
             time.sleep(VENT_PERIOD)
-        waiting = _waiting(descriptor)
+        while (waiting := _waiting(descriptor)) and time.monotonic() < end + CONNECT_TIME:
+            time.sleep(VENT_PERIOD)
     except (OSError, termios.error) as error:
         return f"the port is gone ({error}): {ADVICE}"
     return "" if taken and not waiting else f"the board takes no bytes: {ADVICE}"
