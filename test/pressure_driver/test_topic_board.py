@@ -26,16 +26,16 @@ class Bench:
     def __init__(self):
         self.told = []
         self.host = host_protocol("native")
-        self.board = WatchedBoard(NativeBoard(4, 30_000, known=0), ROOM, self.told.append)
+        self.board = WatchedBoard(NativeBoard(4, 30_000, known=0), self.told.append)
 
     def say(self, data, now):
         return self.host.decode(self.board.receive(data, now))
 
 
 def test_the_topics_have_their_own_unit_and_zero():
-    scale = Scale(TopicBoardSettings(scale=0.01, offset=-5.0, absolute=True))
+    scale = Scale(TopicBoardSettings(scale=0.01, offset=1013.25))
     told = scale.to_topic((100.0, 200.0, 300.0, 400.0))
-    assert told == pytest.approx([1009.25, 1010.25, 1011.25, 1012.25])
+    assert told == pytest.approx([1014.25, 1015.25, 1016.25, 1017.25])
     assert scale.from_topic(told) == pytest.approx([100.0, 200.0, 300.0, 400.0])
 
 

@@ -119,8 +119,7 @@ class TrackerNode(LimbStateNode):
         self.create_subscription(Image, topics.IMAGE, self._on_image, qos.IMAGES)
         if needs_info:
             # Two, since a latched publisher and a volatile one need different subscribers: the one
-            # that asks for the kept message is not matched with a camera that keeps none, which is
-            # no reason for the usual warning.
+            # that asks for the kept message is not matched with a camera that keeps none.
             quiet = SubscriptionEventCallbacks(use_default_callbacks=False)
             kept = CameraInfo, topics.CAMERA_INFO, self._on_info, qos.LATCHED
             self.create_subscription(*kept, event_callbacks=quiet)

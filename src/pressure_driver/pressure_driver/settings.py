@@ -217,19 +217,16 @@ class TopicBoardSettings:
     )
     measured_topic: str = _other("/valves/measured", "pressures that are measured, as above")
     scale: float = _number(1.0, "1/Pa", 1e-9, 1e9, "of the topics: 0.001 where they are in kPa")
-    offset: float = _number(0.0, "", -1e9, 1e9, "added to scaled pressures")
-    absolute: bool = _other(False, "the topics have absolute pressures")
-    atmosphere: float = _number(101_325.0, "Pa", 5e4, 1.1e5, "of the room")
+    offset: float = _number(
+        0.0, "", -1e9, 1e9, "added to scaled pressures: the room's where they are absolute"
+    )
     segment_count: int = _number(2, "", 1, 16, "pairs of chambers")
     largest_pressure: float = _number(30_000.0, "Pa", 0.0, 1e6, "gauge, that the valves take")
 
     def __post_init__(self) -> None:
         for name in ("command_topic", "measured_topic"):
             if self.message == "FluidPressure" and "{}" not in getattr(self, name):
-                raise SettingError(
-                    f"parameter '{name}' is '{getattr(self, name)}': each chamber has a topic of "
-                    "its own, as /valves/chamber{}/… with {} for its place"
-                )
+                raise SettingError(f"parameter '{name}' needs a {{}} for the place of a chamber")
 
 
 NodeSettings = Settings | EmulatorSettings | TopicBoardSettings

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 from pressure_driver.emulator import BoardReading
 from pressure_driver.emulator.firmware import NativeBoard
+from pressure_driver.protocols import STANDARD_ATMOSPHERE
 from pressure_driver.settings import TopicBoardSettings
 
 STALE = 0.2
@@ -18,18 +19,16 @@ class Scale:
     """Between the numbers of a lab's topic and gauge pressures.
 
     Args:
-        settings: `scale` is what one Pa is on the topic, `offset` what is added to that; with
-            `absolute` the room's pressure is part of it.
+        settings: `scale` is what one Pa is on the topic, `offset` what is added to that.
     """
 
     def __init__(self, settings: TopicBoardSettings) -> None:
         self._count = 2 * settings.segment_count
         self._scale, self._offset = settings.scale, settings.offset
-        self._room = settings.atmosphere if settings.absolute else 0.0
 
     def to_topic(self, gauge: Sequence[float]) -> list[float]:
         """Return what a lab is told for gauge pressures (2M,) [Pa]."""
-        return [(value + self._room) * self._scale + self._offset for value in gauge]
+        return [value * self._scale + self._offset for value in gauge]
 
     def from_topic(self, told: Sequence[float]) -> list[float]:
         """Return gauge pressures (2M,) [Pa] for what a lab tells.
@@ -40,7 +39,7 @@ class Scale:
         if len(told) != self._count or not all(map(math.isfinite, told)):
             listed = ", ".join(f"{value:g}" for value in told)
             raise ValueError(f"measured is {listed}: {self._count} numbers are expected")
-        return [(value - self._offset) / self._scale - self._room for value in told]
+        return [(value - self._offset) / self._scale for value in told]
 
 
 class WatchedBoard:
@@ -48,20 +47,15 @@ class WatchedBoard:
 
     Args:
         firmware: the board's end of the protocol.
-        atmosphere: [Pa] of the room.
         regulate: takes gauge pressures (2M,) [Pa], all zero to vent.
     """
 
-    def __init__(
-        self,
-        firmware: NativeBoard,
-        atmosphere: float,
-        regulate: Callable[[Sequence[float]], None],
-    ) -> None:
+    def __init__(self, firmware: NativeBoard, regulate: Callable[[Sequence[float]], None]) -> None:
         self._firmware, self._regulate = firmware, regulate
         count = firmware.chamber_count
         self._zero = (0.0,) * count
-        self._reading = BoardReading(0.0, (atmosphere,) * count, atmosphere, self._zero, 0.0)
+        room = STANDARD_ATMOSPHERE
+        self._reading = BoardReading(0.0, (room,) * count, room, self._zero, 0.0)
         self._valid_until = math.inf
         self._measured_at = -math.inf
 

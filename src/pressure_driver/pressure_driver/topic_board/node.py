@@ -39,7 +39,7 @@ class TopicBoard(Node):
         self._scale = Scale(settings)
         self._count = 2 * settings.segment_count
         firmware = NativeBoard(self._count, round(settings.largest_pressure), known=0)
-        self._board = WatchedBoard(firmware, settings.atmosphere, self._publish)
+        self._board = WatchedBoard(firmware, self._publish)
         self._told: dict[int, list[float]] = {}
         self._refused = ""
         self._arrays = settings.message == "Float64MultiArray"
