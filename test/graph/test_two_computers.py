@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from diagnostic_msgs.msg import DiagnosticStatus
 from domain import own_domain
 
 from der_planner.experiment.console import Progress
@@ -201,3 +202,12 @@ def test_a_node_elsewhere_that_is_missing_or_of_another_version_is_named(heard: 
     graph = RunningGraph(Silent(heard), Progress(), elsewhere={"apriltag_tracker": "camera-pc"})
     with pytest.raises(GraphError, match=told):
         graph._wait_elsewhere()
+
+
+def test_what_a_tracker_warns_of_is_said_before_it_is_played(capsys, tmp_path):
+    client = Silent(True)
+    client.diagnostics = {
+        "apriltag_tracker": DiagnosticStatus(level=DiagnosticStatus.WARN, message="another clock")
+    }
+    RunningGraph(client, Progress()).start([], tmp_path, {})
+    assert "warning: apriltag_tracker: another clock" in capsys.readouterr().err

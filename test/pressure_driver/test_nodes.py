@@ -133,11 +133,11 @@ def test_a_node_that_hangs_in_a_publication_delays_no_setpoint_that_has_arrived(
 
 
 def test_a_lab_s_own_driver_is_played_and_vented_when_this_one_dies(graph):
-    """It hears and tells kPa in an order of its own, and is a board to the driver."""
+    """It hears and tells kPa as sensors do, in its own order, and is a board to the driver."""
     client, told, states = graph.client, [], []
     measured = np.zeros(4)
     generator = np.random.default_rng(0)
-    publisher = client.node.create_publisher(Float64MultiArray, "/valves/measured", 10)
+    publisher = client.node.create_publisher(Float64MultiArray, "/valves/measured", qos.SENSOR_DATA)
 
     def regulate():
         nonlocal measured
@@ -155,12 +155,10 @@ def test_a_lab_s_own_driver_is_played_and_vented_when_this_one_dies(graph):
     )
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = f"tcp://127.0.0.1:{free.getsockname()[1]}"
-    lab = {"scale": 0.001, "order": "2,3,0,1"}
-    board = graph.start("pressure_driver", "topic_board", listen=port, **lab)
+    board = graph.start("pressure_driver", "topic_board", listen=port, scale=0.001)
     client.wait_ready(["topic_board"])
-    driver = graph.start(
-        "pressure_driver", "pressure_driver", port=port, protocol="native", supply_required=False
-    )
+    lab = {"protocol": "native", "supply_required": False, "wiring": "3,4,1,2"}
+    driver = graph.start("pressure_driver", "pressure_driver", port=port, **lab)
     client.watch([board, driver])
     client.wait_ready(["pressure_driver"])
 

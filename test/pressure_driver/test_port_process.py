@@ -11,12 +11,14 @@ import subprocess
 import sys
 import termios
 import time
+from types import SimpleNamespace
 
 import pytest
 from serial import SerialException
 from waiting import wait_for
 
-from pressure_driver import port_process
+from pressure_driver import lines, port_process
+from pressure_driver.board import BoardProcess
 from pressure_driver.emulator.board import EmulatedBoard, Faults
 from pressure_driver.emulator.firmware import BOARDS
 from pressure_driver.emulator.pneumatics import BoardPneumatics
@@ -359,6 +361,28 @@ def test_a_connection_that_ends_is_a_fault_and_the_next_one_vents(make_rigs):
     rig.wait_vented()
     assert rig.mode == Mode.FAULT
     rig.pressurise()
+
+
+@pytest.mark.parametrize("reads", [True, False])
+def test_a_far_board_acknowledges_late_what_it_reads(reads):
+    near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with near, far:
+        process = BoardProcess(Settings(real_time_priority=0), Channel(near), 1.0)
+        lost = []
+        process._line, process._lose = SimpleNamespace(waiting=lambda: 102), lost.append
+        for tick in range(40):
+            process.core.clock = lambda tick=tick: tick / 20
+            process._bytes_sent += 34 * reads
+            process._watch_queue()
+        assert bool(lost) != reads
+
+
+def test_the_last_vent_command_may_be_acknowledged_late(monkeypatch):
+    waiting = iter([102, 34, 0])
+    monkeypatch.setattr(lines, "_waiting", lambda _: next(waiting))
+    near, far = socket.socketpair()
+    with near, far:
+        assert lines.vent_line(near.fileno(), b"vent", 0.01) == ""
 
 
 # ---------------------------------------------------------------------------- names and rights

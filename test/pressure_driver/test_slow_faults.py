@@ -76,6 +76,14 @@ def test_telemetry_that_repeats_itself_is_a_fault_under_a_steady_command(simulat
     assert sim.vented
 
 
+def test_rounded_readings_may_stand_still(simulate):
+    sim = simulate("native", frozen_time=0.0)
+    rise_to_steady(sim)
+    board, reading = sim.board, sim.board.reading()
+    board.reading = lambda: replace(reading, time=board._time, last_sequence=board._sequence)
+    assert stream_until_fault(sim, 5.0) is None, sim.faults
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("protocol", NAMES)
 @pytest.mark.parametrize(("seed", "period"), [(5, 3.0), (6, 20.0)])

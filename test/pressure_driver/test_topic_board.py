@@ -1,5 +1,7 @@
 """A lab's own driver of valves as a board: numbers and order of its topics, and what is watched."""
 
+import math
+
 import pytest
 
 from pressure_driver.emulator.firmware import NativeBoard
@@ -24,23 +26,28 @@ class Bench:
     def __init__(self):
         self.told = []
         self.host = host_protocol("native")
-        self.board = WatchedBoard(NativeBoard(4, 30_000, known=0), ROOM, self.told.append)
+        self.board = WatchedBoard(NativeBoard(4, 30_000, known=0), self.told.append)
 
     def say(self, data, now):
         return self.host.decode(self.board.receive(data, now))
 
 
-def test_the_topics_have_their_own_unit_zero_and_order():
-    scale = Scale(TopicBoardSettings(scale=0.01, offset=-5.0, absolute=True, order="2,3,0,1"))
+def test_the_topics_have_their_own_unit_and_zero():
+    scale = Scale(TopicBoardSettings(scale=0.01, offset=1013.25))
     told = scale.to_topic((100.0, 200.0, 300.0, 400.0))
-    assert told == pytest.approx([1011.25, 1012.25, 1009.25, 1010.25])
+    assert told == pytest.approx([1014.25, 1015.25, 1016.25, 1017.25])
     assert scale.from_topic(told) == pytest.approx([100.0, 200.0, 300.0, 400.0])
 
 
-@pytest.mark.parametrize("order", ["0,1,2", "0,1,2,2", "1,2,3,4", "a,b,c,d"])
-def test_an_order_that_does_not_name_every_chamber_is_refused(order):
-    with pytest.raises(SettingError, match="'order'"):
-        Scale(TopicBoardSettings(order=order))
+@pytest.mark.parametrize("told", [(0.0, 0.0, 0.0), (0.0, 0.0, 0.0, math.nan)])
+def test_readings_that_are_not_a_number_for_each_chamber_are_refused(told):
+    with pytest.raises(ValueError, match="4 numbers are expected"):
+        Scale(TopicBoardSettings()).from_topic(told)
+
+
+def test_one_topic_for_the_pressures_of_each_chamber_is_refused():
+    with pytest.raises(SettingError, match="'measured_topic'"):
+        TopicBoardSettings(message="FluidPressure", command_topic="/valve{}/command")
 
 
 def test_setpoints_are_passed_on_and_readings_come_back():

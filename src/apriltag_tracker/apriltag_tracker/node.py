@@ -11,6 +11,7 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Pose2D
 from numpy.typing import NDArray
+from rclpy.event_handler import SubscriptionEventCallbacks
 from sensor_msgs.msg import CameraInfo, Image
 
 from apriltag_tracker.camera import CameraError, Intrinsics
@@ -119,7 +120,9 @@ class TrackerNode(LimbStateNode):
         if needs_info:
             # Two, since a latched publisher and a volatile one need different subscribers: the one
             # that asks for the kept message is not matched with a camera that keeps none.
-            self.create_subscription(CameraInfo, topics.CAMERA_INFO, self._on_info, qos.LATCHED)
+            quiet = SubscriptionEventCallbacks(use_default_callbacks=False)
+            kept = CameraInfo, topics.CAMERA_INFO, self._on_info, qos.LATCHED
+            self.create_subscription(*kept, event_callbacks=quiet)
             self.create_subscription(CameraInfo, topics.CAMERA_INFO, self._on_info, qos.IMAGES)
 
     # Input

@@ -71,7 +71,7 @@ class BoardProcess:
         self._baud_rate = settings.baud_rate or protocol.baud_rate
         self._line: Line | None = None
         self._bytes_waiting: select.epoll | None = None
-        self._bytes_sent = self._bytes_received = self._reconnects = 0
+        self._bytes_sent = self._bytes_read = self._bytes_received = self._reconnects = 0
         self._unsent = b""
         self._unread = Duration()
         self._was_venting = True
@@ -237,21 +237,24 @@ class BoardProcess:
         if self._line is not None or time.monotonic() < self._retry_at:
             return
         if may_open(self._port):
-            self._retry_at = time.monotonic() + RETRY_TIME
             with contextlib.suppress(OSError, ValueError):
                 self._line = open_line(self._port, self._baud_rate)
                 self._reconnects += 1
                 self._log(f"{self._port} is back", True)
                 self._opened()
+            self._retry_at = time.monotonic() + RETRY_TIME
 
     def _watch_queue(self) -> None:
         """Lose the port if what has been written stays where it is: the board does not read."""
         if self._line is None:
             return
-        now, waiting = self.core.clock(), len(self._unsent)
+        now, waiting = self.core.clock(), 0
         with contextlib.suppress(OSError):
-            waiting += self._line.waiting()
-        self._unread.note(waiting > 0, now)
+            waiting = self._line.waiting()
+        # What is under way to a board that is far is acknowledged later.
+        read, self._bytes_read = self._bytes_read, self._bytes_sent - waiting
+        waiting += len(self._unsent)
+        self._unread.note(waiting > 0 and self._bytes_read == read, now)
         if self._unread.until(now) > UNREAD_TIME:
             self._lose(
                 f"the board on {self._port} does not read: {waiting} bytes have been waiting for "

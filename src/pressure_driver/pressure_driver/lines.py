@@ -29,8 +29,8 @@ VENT_TIME = 1.0
 """[s] for which one process of the driver vents in the place of the other."""
 VENT_PERIOD = 0.05
 """[s] between two vent commands of a process that vents in the place of another."""
-CONNECT_TIME = 0.1
-"""[s] for a connection: a board in the same room answers in 0.001 s, and meanwhile nothing runs."""
+CONNECT_TIME = 0.4
+"""[s] for a connection: over WLAN some take 0.2 s, and meanwhile nothing runs."""
 LONGEST_LOOK = 20_000_000
 """[ns] between two looks for a host that wants a connection."""
 ADVICE = "close the air supply"
@@ -243,7 +243,8 @@ def vent_line(descriptor: int, command: bytes, duration: float) -> str:
                 taken = False
                 _flush(descriptor)
             time.sleep(VENT_PERIOD)
-        waiting = _waiting(descriptor)
+        while (waiting := _waiting(descriptor)) and time.monotonic() < end + CONNECT_TIME:
+            time.sleep(VENT_PERIOD)
     except (OSError, termios.error) as error:
         return f"the port is gone ({error}): {ADVICE}"
     return "" if taken and not waiting else f"the board takes no bytes: {ADVICE}"

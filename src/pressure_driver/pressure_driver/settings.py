@@ -104,6 +104,9 @@ class Settings:
     vent_rate: float = _number(10_000.0, "Pa/s", 100.0, 1e6, "of the ramp down")
     vent_timeout: float = _number(10.0, "s", 0.5, 120.0, "a vent may take before it is a fault")
     telemetry_timeout: float = _number(0.5, "s", 0.06, 60.0, "without chamber pressures")
+    frozen_time: float = _number(
+        2.0, "s", 0.0, 600.0, "in which `ezloop` and `native` readings change; 0: they need not"
+    )
     over_pressure: float = _number(30_000.0, "Pa", 1.0, 2e5, "gauge, in any chamber")
     supply_low: float = _number(115_000.0, "Pa", 0.0, 1e6, "absolute, smallest supply")
     supply_high: float = _number(200_000.0, "Pa", 0.0, 1e6, "absolute, largest supply")
@@ -209,16 +212,21 @@ class TopicBoardSettings:
         ("Float64MultiArray", "FluidPressure"),
     )
     command_topic: str = _other(
-        "/valves/command", "pressures to regulate to; {} stands for the place of a chamber"
+        "/valves/command",
+        "pressures to regulate to; {} is the place of a chamber, as in /valve{}/command",
     )
     measured_topic: str = _other("/valves/measured", "pressures that are measured, as above")
     scale: float = _number(1.0, "1/Pa", 1e-9, 1e9, "of the topics: 0.001 where they are in kPa")
-    offset: float = _number(0.0, "", -1e9, 1e9, "added to scaled pressures")
-    absolute: bool = _other(False, "the topics have absolute pressures")
-    order: str = _other("0,1,2,3", "the chamber at each place of the topics")
-    atmosphere: float = _number(101_325.0, "Pa", 5e4, 1.1e5, "of the room")
+    offset: float = _number(
+        0.0, "", -1e9, 1e9, "added to scaled pressures: the room's where they are absolute"
+    )
     segment_count: int = _number(2, "", 1, 16, "pairs of chambers")
     largest_pressure: float = _number(30_000.0, "Pa", 0.0, 1e6, "gauge, that the valves take")
+
+    def __post_init__(self) -> None:
+        for name in ("command_topic", "measured_topic"):
+            if self.message == "FluidPressure" and "{}" not in getattr(self, name):
+                raise SettingError(f"parameter '{name}' needs a {{}} for the place of a chamber")
 
 
 NodeSettings = Settings | EmulatorSettings | TopicBoardSettings

@@ -29,9 +29,6 @@ MOST_BAD_READINGS = 8
 MOST_DAMAGED = 10
 """Damaged lines or frames in `READING_WINDOW`, if they are also `DAMAGED_SHARE` of all."""
 DAMAGED_SHARE = 0.3
-FROZEN_TIME = 2.0
-"""[s] in which the readings of working sensors differ, on boards that tell them to 1 Pa: in logs of
-a real board no two in a row were alike."""
 PLAUSIBLE_ATMOSPHERE = (70_000.0, 105_000.0)
 """[Pa] at 3000 m, and above what the barometer reads at sea level but for a few days in a century:
 chambers that rest higher hold trapped air, unless the parameter 'atmosphere' says otherwise."""
@@ -282,8 +279,12 @@ class TelemetryMonitor:
             )
         if age > self._settings.telemetry_timeout:
             return f"no telemetry: the last came {age:.1f} s ago"
-        if self._protocol.tells_pascals and self._read_at - self._changed_at > FROZEN_TIME:
-            return f"telemetry is frozen: no reading has changed in {FROZEN_TIME:g} s"
+        patience = self._settings.frozen_time if self._protocol.tells_pascals else 0.0
+        if 0.0 < patience < self._read_at - self._changed_at:
+            return (
+                f"telemetry is frozen: no reading has changed in {patience:g} s; where sensors are "
+                "rounded, set the parameter 'frozen_time' to 0"
+            )
         return ""
 
     def following_faults(self, now: float) -> Iterator[str]:

@@ -165,7 +165,7 @@ def test_bag_without_plan_or_states_is_refused(tmp_path: Path):
     bag.plan()
     bag.setpoint(0, [0.0, 0.0])
     bag.bag.close()
-    with pytest.raises(EvaluationError, match="did the tracker run"):
+    with pytest.raises(EvaluationError, match="see whether the tracker ran"):
         load_run(tmp_path / "no_state")
 
 

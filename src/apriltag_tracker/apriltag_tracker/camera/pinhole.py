@@ -79,7 +79,7 @@ class Intrinsics:
         if model and model not in PINHOLE_MODELS:
             raise CameraError(
                 f"distortion model '{model}': {' and '.join(PINHOLE_MODELS)} are known; calibrate "
-                "again with scripts/calibrate_camera.py"
+                "again with scripts/calibrate_camera.py --rational"
             )
         if width <= 0 or height <= 0:
             raise CameraError(f"camera_info says {width} x {height} px: the size must be positive")

@@ -170,7 +170,7 @@ def _bag_files(path: Path) -> list[Path]:
         return [path]
     found = sorted(path.glob("*.mcap"), key=_file_number)
     if not found:
-        raise RecoverError(f"{path} holds no MCAP file")
+        raise RecoverError(f"{path} holds no MCAP file; sqlite3: `ros2 bag reindex {path}`")
     return found
 
 

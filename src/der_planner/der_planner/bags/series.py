@@ -107,7 +107,8 @@ def run_of(record: BagRecord, namespace: str, plan_id: str = "") -> RunSeries:
     tip = stream(limb.tip, 2, origin)
     if not len(tip) or tip.time[-1] < 0 or tip.time[0] > end:
         raise EvaluationError(
-            f"{where}: no limb state was recorded while the plan was played: did the tracker run?"
+            f"{where}: no limb state was recorded while the plan was played: see whether "
+            "the tracker ran, and the camera's stamps are of the planner's clock"
         )
     return RunSeries(
         description=_describe(plan, record, namespace, feedback),

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.executors import ExternalShutdownException
 
 from der_msgs.msg import PressureState
@@ -142,6 +143,10 @@ class RunningGraph:
                 self.client.wait_ready([spec.executable])
         self._wait_elsewhere()
         self.client.wait_ready(self.processes)
+        for name in ("apriltag_tracker", "pose_tracker"):
+            status = self.client.diagnostics.get(name)
+            if status is not None and status.level == DiagnosticStatus.WARN:
+                self.progress.say(f"  warning: {name}: {status.message}")
         self.progress.say(f"  ready after {time.monotonic() - begin:.1f} s")
 
     def _wait_elsewhere(self) -> None:

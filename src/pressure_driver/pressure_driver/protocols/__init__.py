@@ -31,25 +31,23 @@ class SettingError(ValueError):
     """A parameter has a value that the driver cannot work with; the message names both."""
 
 
-def order_of(text: str, count: int, first: int = 1, name: str = "wiring") -> tuple[int, ...]:
-    """Return the numbers (count,), counted from 0, of a parameter like `wiring`.
+def order_of(text: str, count: int) -> tuple[int, ...]:
+    """Return the numbers (count,), counted from 0, of a parameter `wiring`.
 
     Args:
-        text: each number once; empty: in order.
+        text: each number from 1 on once; empty: in order.
         count: of them.
-        first: the smallest one.
-        name: of the parameter.
 
     Raises:
         SettingError: it does not name each of them once.
     """
-    usual = [str(first + k) for k in range(count)]
+    usual = [str(1 + k) for k in range(count)]
     named = text.replace(",", " ").split() or usual
     if sorted(named) != sorted(usual):
         raise SettingError(
-            f"parameter '{name}' is '{text}': name each of {', '.join(usual)} once, in any order"
+            f"parameter 'wiring' is '{text}': name each of {', '.join(usual)} once, in any order"
         )
-    return tuple(int(number) - first for number in named)
+    return tuple(int(number) - 1 for number in named)
 
 
 @dataclass(frozen=True)

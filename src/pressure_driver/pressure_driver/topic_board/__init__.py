@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from pressure_driver.emulator import BoardReading
 from pressure_driver.emulator.firmware import NativeBoard
-from pressure_driver.protocols import order_of
+from pressure_driver.protocols import STANDARD_ATMOSPHERE
 from pressure_driver.settings import TopicBoardSettings
 
 STALE = 0.2
@@ -19,28 +19,27 @@ class Scale:
     """Between the numbers of a lab's topic and gauge pressures.
 
     Args:
-        settings: `scale` is what one Pa is on the topic, `offset` what is added to that; with
-            `absolute` the room's pressure is part of it. `order` names, for each place of the
-            lab's array, the chamber that stands there.
-
-    Raises:
-        SettingError: the order does not name every chamber once.
+        settings: `scale` is what one Pa is on the topic, `offset` what is added to that.
     """
 
     def __init__(self, settings: TopicBoardSettings) -> None:
-        count = 2 * settings.segment_count
-        self._order = order_of(settings.order, count, first=0, name="order")
+        self._count = 2 * settings.segment_count
         self._scale, self._offset = settings.scale, settings.offset
-        self._room = settings.atmosphere if settings.absolute else 0.0
 
     def to_topic(self, gauge: Sequence[float]) -> list[float]:
-        """Return what a lab is told, in its order, for gauge pressures (2M,) [Pa]."""
-        return [(gauge[k] + self._room) * self._scale + self._offset for k in self._order]
+        """Return what a lab is told for gauge pressures (2M,) [Pa]."""
+        return [value * self._scale + self._offset for value in gauge]
 
     def from_topic(self, told: Sequence[float]) -> list[float]:
-        """Return gauge pressures (2M,) [Pa] for what a lab tells, in its order."""
-        gauge = [(value - self._offset) / self._scale - self._room for value in told]
-        return [gauge[self._order.index(chamber)] for chamber in range(len(gauge))]
+        """Return gauge pressures (2M,) [Pa] for what a lab tells.
+
+        Raises:
+            ValueError: it does not tell one number for each chamber.
+        """
+        if len(told) != self._count or not all(map(math.isfinite, told)):
+            listed = ", ".join(f"{value:g}" for value in told)
+            raise ValueError(f"measured is {listed}: {self._count} numbers are expected")
+        return [(value - self._offset) / self._scale for value in told]
 
 
 class WatchedBoard:
@@ -48,22 +47,21 @@ class WatchedBoard:
 
     Args:
         firmware: the board's end of the protocol.
-        atmosphere: [Pa] of the room.
         regulate: takes gauge pressures (2M,) [Pa], all zero to vent.
     """
 
-    def __init__(
-        self,
-        firmware: NativeBoard,
-        atmosphere: float,
-        regulate: Callable[[Sequence[float]], None],
-    ) -> None:
+    def __init__(self, firmware: NativeBoard, regulate: Callable[[Sequence[float]], None]) -> None:
         self._firmware, self._regulate = firmware, regulate
         count = firmware.chamber_count
         self._zero = (0.0,) * count
-        self._reading = BoardReading(0.0, (atmosphere,) * count, atmosphere, self._zero, 0.0)
+        room = STANDARD_ATMOSPHERE
+        self._reading = BoardReading(0.0, (room,) * count, room, self._zero, 0.0)
         self._valid_until = math.inf
         self._measured_at = -math.inf
+
+    def hears(self, now: float) -> bool:
+        """Tell whether pressures have been measured just now (steady clock [s])."""
+        return now - self._measured_at < STALE
 
     def receive(self, data: bytes, now: float) -> bytes:
         """Execute the commands of the driver; return the answers (steady clock [s])."""
@@ -77,8 +75,7 @@ class WatchedBoard:
                 )
                 self._regulate(command.pressure or self._zero)
             # An answer holds readings: old ones would pass for new ones.
-            fresh = now - self._measured_at < STALE
-            if fresh or command.kind in ("hello", "refused"):
+            if self.hears(now) or command.kind in ("hello", "refused"):
                 answers += self._firmware.reply(command, replace(self._reading, time=now))
         return answers
 

@@ -15,7 +15,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import FluidPressure
 from std_msgs.msg import Float64MultiArray, Header
 
-from limb_interfaces import topics
+from limb_interfaces import qos, topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
 from limb_interfaces.runner import run_node
 from pressure_driver.emulator.firmware import NativeBoard
@@ -39,19 +39,18 @@ class TopicBoard(Node):
         self._scale = Scale(settings)
         self._count = 2 * settings.segment_count
         firmware = NativeBoard(self._count, round(settings.largest_pressure), known=0)
-        self._board = WatchedBoard(firmware, settings.atmosphere, self._publish)
+        self._board = WatchedBoard(firmware, self._publish)
         self._told: dict[int, list[float]] = {}
         self._refused = ""
         self._arrays = settings.message == "Float64MultiArray"
         kind = Float64MultiArray if self._arrays else FluidPressure
-        self._regulators = []
-        for place in range(1 if self._arrays else self._count):
-            told, heard = settings.command_topic, settings.measured_topic
-            self._regulators.append(
-                self.create_publisher(kind, told.replace("{}", str(place)), DEPTH)
-            )
-            take = partial(self._take, place)
-            self.create_subscription(kind, heard.replace("{}", str(place)), take, DEPTH)
+        places = range(1 if self._arrays else self._count)
+        commands = [settings.command_topic.replace("{}", str(place)) for place in places]
+        self._regulators = [self.create_publisher(kind, topic, DEPTH) for topic in commands]
+        self._heard = [settings.measured_topic.replace("{}", str(place)) for place in places]
+        for place, topic in enumerate(self._heard):
+            # Best effort hears reliable publishers as well.
+            self.create_subscription(kind, topic, partial(self._take, place), qos.SENSOR_DATA)
         self._socket = BoardSocket(settings.listen)
         self.create_timer(LOOK, self._serve)
         DiagnosticsPublisher(self, self._report, hardware_id=settings.listen)
@@ -76,23 +75,27 @@ class TopicBoard(Node):
 
     def _take(self, place: int, message: Float64MultiArray | FluidPressure) -> None:
         """Take pressures of one topic; the last of a set makes a report."""
-        values = message.data if self._arrays else [message.fluid_pressure]
-        self._told[place] = list(values)
-        if len(self._told) < len(self._regulators):
+        self._told[place] = list(message.data if self._arrays else [message.fluid_pressure])
+        if len(self._told) < len(self._heard):
             return
         told = [value for _, values in sorted(self._told.items()) for value in values]
         self._told.clear()
-        self._refused = ""
-        if len(told) != self._count:
-            self._refused = f"{len(told)} pressures are measured, there are {self._count} chambers"
+        try:
+            gauge = self._scale.from_topic(told)
+        except ValueError as error:
+            self._refused = str(error)
             return
-        self._socket.send(self._board.measured(self._scale.from_topic(told), time.monotonic()))
+        self._refused = ""
+        self._socket.send(self._board.measured(gauge, time.monotonic()))
         self._socket.pump(0)
 
     def _report(self) -> Health:
-        present = self._socket.host_present
-        text = self._refused or ("regulating" if present else "no driver")
-        return Health("error" if self._refused else "ok", text, {"host_present": present})
+        problem, present = self._refused, self._socket.host_present
+        if not problem and not self._board.hears(time.monotonic()):
+            silent = [topic for place, topic in enumerate(self._heard) if place not in self._told]
+            problem = f"no pressures are measured on {', '.join(silent)}"
+        text = problem or ("regulating" if present else "no driver")
+        return Health("error" if problem else "ok", text, {"host_present": present})
 
     def close(self) -> None:
         """Vent, whoever may have died before, and leave the network."""
