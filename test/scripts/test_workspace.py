@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -64,6 +66,13 @@ def test_the_environment_holds_nothing_of_another_workspace(monkeypatch: pytest.
     assert "/somebody/elses" not in inside["CMAKE_PREFIX_PATH"]
     for package in workspace.PACKAGES:
         assert f"install/{package}" in inside["AMENT_PREFIX_PATH"]
+
+
+def test_each_script_runs_a_module_that_is_there():
+    texts = [path.read_text() for path in (ROOT / "scripts").glob("*.py")]
+    modules = re.findall(r'workspace\.run\("([\w.]+)"\)', "\n".join(texts))
+    assert len(modules) > 10
+    assert [module for module in modules if importlib.util.find_spec(module) is None] == []
 
 
 def test_a_package_that_is_gone_is_built_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

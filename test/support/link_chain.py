@@ -18,7 +18,9 @@ give the same result, always: a run draws the sensors' noise. One second takes a
 
 from __future__ import annotations
 
+import fcntl
 from collections.abc import Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -309,3 +311,9 @@ def _first_frequency(links: Links) -> float:
     turn = np.eye(len(index)) - np.eye(len(index), k=-1)
     squares = eigvalsh(turn.T @ np.diag(links.stiffness) @ turn, mass)
     return float(np.sqrt(squares[0]))
+
+
+with Path(__file__).open() as alone:
+    # In a new clone one worker compiles the kernel, while the others wait for its cache.
+    fcntl.flock(alone, fcntl.LOCK_EX)
+    LinkChain(0)

@@ -47,15 +47,26 @@ def planned() -> Plan:
     return plan(Limb.default(), Motion.named("asynchronous", period=12.0, cycles=1))
 
 
+def play_watched(planned: Plan, feedback: Feedback) -> tuple[Played, np.ndarray]:
+    """Return a run with feedback on the chain, and the share that was sent, by period."""
+    share = np.zeros(len(planned.time) + 1)
+
+    def event(time: float) -> None:
+        share[int(20 * time + 1e-6)] = feedback.share
+
+    return play(planned, Chain(), feedback, event=event), share
+
+
 @pytest.fixture(scope="module")
-def corrected(planned: Plan) -> tuple[Played, Feedback]:
-    """Return a run with feedback on the chain."""
+def corrected(planned: Plan) -> tuple[Played, Feedback, np.ndarray]:
+    """Return such a run, its feedback and its shares."""
     feedback = Feedback(planned)
-    return play(planned, Chain(), feedback), feedback
+    played, share = play_watched(planned, feedback)
+    return played, feedback, share
 
 
 def test_a_limb_that_was_never_calibrated_is_followed(planned, corrected):
-    played, feedback = corrected
+    played, feedback, _ = corrected
     alone = play(planned, Chain())
     after = played.time > 1.0
     assert alone.error[after].mean() > 0.02 * LENGTH
@@ -65,7 +76,7 @@ def test_a_limb_that_was_never_calibrated_is_followed(planned, corrected):
 
 
 def test_commands_keep_all_limits(planned, corrected):
-    played, _ = corrected
+    played, *_ = corrected
     air = planned.limb.pneumatics
     assert np.abs(played.commanded).max() <= air.pressure_limit
     steps = np.diff(played.commanded, axis=0, prepend=np.zeros((1, 2)))
@@ -111,7 +122,7 @@ def test_feedback_and_learning_do_not_fight(planned):
 
 
 def test_the_estimate_knows_how_good_it_is(corrected):
-    played, feedback = corrected
+    played, feedback, _ = corrected
     squares = np.array([square for time, square, _ in feedback.innovations if time > 1.0])
     coordinates = sum(count for time, _, count in feedback.innovations if time > 1.0)
     assert 0.3 < squares.sum() / coordinates < 1.5
@@ -188,22 +199,18 @@ def test_another_motion_takes_over_without_a_jump(planned):
     assert np.mean(errors) < 0.025 * LENGTH
 
 
-def test_the_next_run_remembers_what_corrections_bring_once_it_has_left_its_rest(planned):
-    feedback, errors, shares = Feedback(planned), [], np.zeros((2, len(planned.time) + 1))
-    for run, share in enumerate(shares):
-        if run:
-            earlier, feedback = feedback, Feedback(planned)
-            feedback.remember(earlier)
-
-        def event(time: float, share=share, feedback=feedback) -> None:
-            share[int(20 * time + 1e-6)] = feedback.share
-
-        errors.append(play(planned, Chain(), feedback, event=event).error.mean())
+def test_the_next_run_remembers_what_corrections_bring_once_it_has_left_its_rest(
+    planned, corrected
+):
+    first, earlier, before = corrected
+    feedback = Feedback(planned)
+    feedback.remember(earlier)
+    second, share = play_watched(planned, feedback)
     moved = planned.reference.bend_angles - planned.reference.bend_angles[0]
     leaves = int(np.argmax(np.abs(moved).max(axis=1) > 0.1))
-    np.testing.assert_array_equal(shares[1, :leaves], shares[0, :leaves])
-    assert shares[1, 100] > shares[0, 100] + 0.15
-    assert errors[1] < 0.9 * errors[0]
+    np.testing.assert_array_equal(share[:leaves], before[:leaves])
+    assert share[100] > before[100] + 0.15
+    assert second.error.mean() < 0.9 * first.error.mean()
 
 
 def test_lost_tags_lead_back_to_the_plan(planned):

@@ -39,9 +39,15 @@ MOUNTED = {
 }
 
 
-@pytest.mark.parametrize("mounting", MOUNTED)
 @pytest.mark.parametrize(
-    ("name", "amplitude"), [("asynchronous", 0.3), ("same_direction", 0.3), ("circle", 0.5)]
+    ("mounting", "name", "amplitude"),
+    [
+        ("hanging", "asynchronous", 0.3),
+        ("hanging", "circle", 0.5),
+        ("tilted, with a payload", "same_direction", 0.3),
+        ("sideways", "circle", 0.5),
+        ("standing", "asynchronous", 0.3),
+    ],
 )
 def test_plans_begin_and_end_at_rest_and_reach_their_reference(mounting, name, amplitude):
     limb = MOUNTED[mounting]

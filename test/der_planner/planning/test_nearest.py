@@ -126,9 +126,12 @@ def scrawl(random):
 
 @pytest.mark.slow
 def test_no_scrawl_is_refused():
-    """The nearest path that is shown is one that the rod can be planned along."""
+    """The nearest path that is shown is one that the rod can be planned along.
+
+    28, 51 and 66 were refused where bend angles went beyond their limits at the edge of the reach.
+    """
     left = []
-    for seed in range(25):
+    for seed in (*range(6), 28, 51, 66):
         random = np.random.default_rng(seed)
         body = RodModel(uneven_limb(random))
         space = Workspace(body)

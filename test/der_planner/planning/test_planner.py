@@ -12,7 +12,6 @@ from der_planner.planning import (
     Motion,
     PlanningError,
     Start,
-    UnreachableError,
     Workspace,
     plan,
 )
@@ -257,12 +256,6 @@ def test_unknown_models_and_methods_are_named(model_name, method, message):
 def test_what_is_no_motion_is_told_how_to_make_one():
     with pytest.raises(PlanningError, match=r"got str: Motion\.named\(name\) with .*, star; or"):
         plan(LIMB, "star")
-
-
-@pytest.mark.parametrize("which", EVERY)
-def test_too_large_an_amplitude_is_refused_by_all(which):
-    with pytest.raises(UnreachableError, match="out of reach"):
-        plan(LIMB, Motion.named("same_direction", amplitude=1.7), *which)
 
 
 def test_cancelling_by_progress_ends_the_planning():

@@ -1,7 +1,6 @@
 """The commands on bags, as people call them."""
 
 import json
-import subprocess
 import sys
 from pathlib import Path
 
@@ -9,17 +8,23 @@ import pytest
 from link_chain import LinkChain
 from runs import BagOfRun
 
+from der_planner.bags import recover
+from der_planner.commands import evaluate
 from der_planner.limb import Limb
 from der_planner.planning import Motion, plan
 
 pytestmark = pytest.mark.slow
 
-SCRIPTS = Path(__file__).resolve().parents[3] / "scripts"
 
+@pytest.fixture
+def run(monkeypatch, capsys):
+    """Return what calls a command's main and returns its exit code, stdout and stderr."""
 
-def run(script: str, *arguments: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, str(SCRIPTS / script), *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    def call(command, *arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", [command.__name__, *map(str, arguments)])
+        return command.main(), *capsys.readouterr()
+
+    return call
 
 
 @pytest.fixture(scope="module")
@@ -31,12 +36,12 @@ def experiment(tmp_path_factory) -> Path:
     return folder
 
 
-def test_evaluate_an_experiment_and_a_bag_that_is_none(experiment: Path, tmp_path: Path):
+def test_evaluate_an_experiment_and_a_bag_that_is_none(run, experiment: Path, tmp_path: Path):
     missing = tmp_path / "missing"
-    done = run("evaluate.py", experiment, missing, "--results", tmp_path)
-    assert done.returncode == 1
-    assert f"error: no bag at {missing}" in done.stderr
-    assert "0.60 cm less error" in done.stdout
+    code, said, complaint = run(evaluate, experiment, missing, "--results", tmp_path)
+    assert code == 1
+    assert f"error: no bag at {missing}" in complaint
+    assert "0.60 cm less error" in said
     document = json.loads((tmp_path / "results.json").read_text())
     errors = {entry["model"]: entry["mean_error_m"] for entry in document["runs"]}
     assert errors == {
@@ -45,18 +50,18 @@ def test_evaluate_an_experiment_and_a_bag_that_is_none(experiment: Path, tmp_pat
     }
 
 
-def test_recover_says_what_it_did(experiment: Path):
+def test_recover_says_what_it_did(run, experiment: Path):
     bag = experiment / "bags" / "der"
     file = bag / "der_0.mcap"
     file.write_bytes(file.read_bytes()[:-40])
-    done = run("recover_bag.py", bag, bag.parent / "pcc", bag / "missing")
-    assert done.returncode == 1
-    assert f"saved in {bag}_recovered; lost: " in done.stdout
-    assert "whole, nothing to recover" in done.stdout
-    assert "missing" in done.stderr
+    code, said, complaint = run(recover, bag, bag.parent / "pcc", bag / "missing")
+    assert code == 1
+    assert f"saved in {bag}_recovered; lost: " in said
+    assert "whole, nothing to recover" in said
+    assert "missing" in complaint
 
 
-def test_what_touched_a_recorded_limb_is_told(tmp_path: Path):
+def test_what_touched_a_recorded_limb_is_told(run, tmp_path: Path):
     planned, chain = plan(Limb.default(), Motion.named("same_direction", 0.3, 6.0, 1)), LinkChain(3)
     planned.limb.to_yaml(tmp_path / "limb.yaml")
     bag = BagOfRun(tmp_path / "bag", run=json.dumps({"trial": 1, "seed": 1}))
@@ -72,6 +77,7 @@ def test_what_touched_a_recorded_limb_is_told(tmp_path: Path):
         bag.state(when, seen.tip, bend=seen.bend_angles)
         chain.advance(command, 0.05)
     bag.bag.close()
-    done = run("evaluate.py", tmp_path / "bag", "--contact", "--limb", tmp_path / "limb.yaml")
-    assert done.returncode == 0, done.stderr
-    assert "touched from 5." in done.stdout
+    limb = ("--limb", tmp_path / "limb.yaml")
+    code, said, complaint = run(evaluate, tmp_path / "bag", "--contact", *limb)
+    assert code == 0, complaint
+    assert "touched from 5." in said

@@ -23,12 +23,6 @@ def test_backward_euler_agrees_with_three_independent_codes(plane):
     assert shift[1] == 0.0
 
 
-@pytest.mark.parametrize("plane", ["xz", None])
-def test_midpoint_agrees_with_the_known_tips(plane):
-    for dt, tip in ((10e-3, -113.41e-3), (5e-3, -112.89e-3)):
-        assert released(cantilever(plane=plane), dt, "midpoint")[2] == pytest.approx(tip, abs=1e-5)
-
-
 def test_every_method_converges_to_the_known_limit():
     rod = cantilever()
     assert released(rod, 1e-4, "midpoint")[2] == pytest.approx(-112.78e-3, abs=1.5e-5)

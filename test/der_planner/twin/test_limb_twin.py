@@ -73,8 +73,10 @@ def test_first_frequency_is_a_cantilevers():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mounting", ["horizontal", "hanging", "standing", "sideways"])
-@pytest.mark.parametrize("payload", [0.0, 0.05])
+@pytest.mark.parametrize(
+    ("mounting", "payload"),
+    [("horizontal", 0.0), ("hanging", 0.05), ("standing", 0.05), ("sideways", 0.05)],
+)
 def test_stable_for_every_admissible_pressure_mounting_and_payload(mounting, payload):
     generator = np.random.default_rng(1)
     masses = (PointMass(0.244, payload),) if payload else ()

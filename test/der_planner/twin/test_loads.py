@@ -17,7 +17,6 @@ from der_planner.twin.offline import play
 pytestmark = pytest.mark.slow
 
 REST = np.full(4, ATMOSPHERE)
-MOUNTINGS = ("hanging", "standing", "sideways", "10", "-30")
 
 
 def elastic(**changes: float):
@@ -67,8 +66,7 @@ def beam_tip(hardware, gravity, payload: float = 0.0, at: float = 0.244):
     return from_the_tip(tip_heading)[1]
 
 
-@pytest.mark.parametrize("mounting", ["sideways", "10", "-30"])
-@pytest.mark.parametrize("payload", [0.0, 0.02])
+@pytest.mark.parametrize(("mounting", "payload"), [("sideways", 0.02), ("10", 0.0), ("-30", 0.02)])
 def test_a_resting_limb_is_the_beam_of_the_textbook(mounting, payload):
     hardware, gravity = elastic(), gravity_of(mounting)
     masses = (PointMass(0.244, payload),) if payload else ()
@@ -92,7 +90,7 @@ def test_a_mass_keeps_its_weight_and_its_place():
     assert own.sum() == pytest.approx(total)
 
 
-@pytest.mark.parametrize("mounting", MOUNTINGS)
+@pytest.mark.parametrize("mounting", ["hanging", "standing", "-30"])
 def test_a_run_begins_at_rest_and_stays_there_until_something_happens(mounting):
     for seed, payload in ((1, 0.0), (2, 0.05)):
         masses = (PointMass(0.244, payload),) if payload else ()
