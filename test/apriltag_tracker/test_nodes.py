@@ -11,9 +11,12 @@ import rclpy
 from domain import own_domain
 from geometry_msgs.msg import Point
 from sensor_msgs.msg import CameraInfo, Image
+from waiting import wait_for
 
 from apriltag_tracker.bodies.node import PoseTrackerNode
 from apriltag_tracker.bodies.tracker import PoseFrame
+from apriltag_tracker.camera import CameraError
+from apriltag_tracker.node import TrackerNode
 from apriltag_tracker.synthetic.camera import SyntheticCamera
 from apriltag_tracker.synthetic.shapes import constant_curvature
 from der_msgs.msg import LimbShape, LimbState, TagDetectionArray
@@ -145,28 +148,41 @@ def test_bad_input_is_named_and_gives_no_state(graph, states, tags, model):
     assert "640 x 480" in state.reason
 
 
-def test_pictures_of_a_folder_are_tracked(graph, states, tags, model, tmp_path):
+@pytest.fixture
+def make_here():
+    """Return a function that makes a tracker in this process, with parameters of its own."""
+
+    def make(kind, **parameters):
+        words = [word for name, value in parameters.items() for word in ("-p", f"{name}:={value}")]
+        rclpy.init(args=["--ros-args", *words], domain_id=own_domain(__file__))
+        return kind()
+
+    yield make
+    rclpy.shutdown()
+
+
+def test_pictures_of_a_folder_are_tracked(make_here, tags, model, tmp_path):
     folder = tmp_path / "pictures"
     folder.mkdir()
     camera = SyntheticCamera(model, tags)
     shape = constant_curvature(tags.segment_lengths, [0.3, 0.2])
-    for k in range(20):
+    for k in range(3):
         cv2.imwrite(str(folder / f"{k:03d}.png"), camera.frame(shape).image)
-    model.intrinsics.to_yaml(tmp_path / "camera.yaml")
-    lens = {"calibration_file": str(tmp_path / "camera.yaml")}
-    source = {"source": str(folder), "source_rate": 2.0}
-    tracker = graph.start("apriltag_tracker", "apriltag_tracker", **source, **lens)
-    graph.client.watch([tracker])
-    graph.client.wait_for(lambda: [s for s in states if s.valid], PATIENCE, "a valid state")
-    state = next(s for s in states if s.valid)
-    assert np.hypot(state.tip.x - shape.points[-1][0], state.tip.y - shape.points[-1][1]) < 5e-4
+    lens = tmp_path / "camera.yaml"
+    model.intrinsics.to_yaml(lens)
+    node = make_here(TrackerNode, source=folder, source_rate=10.0, calibration_file=lens)
+    states = []
+    node.create_subscription(LimbState, topics.LIMB_STATE, states.append, qos.STATES)
+    wait_for(lambda: rclpy.spin_once(node, timeout_sec=0.1) or states, "a state", PATIENCE)
+    node.destroy_node()
+    tip = states[0].tip
+    assert states[0].valid
+    assert np.hypot(*np.subtract([tip.x, tip.y], shape.points[-1])) < 5e-4
 
 
-def test_a_source_without_calibration_ends_the_node_with_the_remedy(graph):
-    tracker = graph.start("apriltag_tracker", "apriltag_tracker", source="/nowhere/video.avi")
-    graph.client.wait_for(lambda: not tracker.alive, PATIENCE, "the end of the node")
-    assert tracker.exit_code == 1
-    assert "calibration_file" in tracker.last_words(20)
+def test_a_source_without_calibration_is_refused_with_the_remedy(make_here):
+    with pytest.raises(CameraError, match="calibration_file"):
+        make_here(TrackerNode, source="/nowhere/video.avi")
 
 
 def test_poses_of_motion_capture_become_the_tip(graph, states, config, tags, tmp_path):
@@ -196,18 +212,14 @@ def test_poses_of_motion_capture_become_the_tip(graph, states, config, tags, tmp
     assert float(told) < 1.0
 
 
-def test_poses_that_tell_no_limb_are_an_error_with_all_that_is_known():
-    rclpy.init(domain_id=own_domain(__file__))
-    try:
-        node = PoseTrackerNode()
-        node._assembler.astray["limb_5"] = 3.0
-        frame = PoseFrame(10**9, np.full((8, 3), np.nan), np.full((8, 4), np.nan))
-        node._on_frame(frame)
-        node._tracker.base.problem = ""
-        told = node._health()
-        node.destroy_node()
-    finally:
-        rclpy.shutdown()
+def test_poses_that_tell_no_limb_are_an_error_with_all_that_is_known(make_here):
+    node = make_here(PoseTrackerNode)
+    node._assembler.astray["limb_5"] = 3.0
+    frame = PoseFrame(10**9, np.full((8, 3), np.nan), np.full((8, 4), np.nan))
+    node._on_frame(frame)
+    node._tracker.base.problem = ""
+    told = node._health()
+    node.destroy_node()
     assert told.level == "error"
     assert "no base" in told.message
     assert "stamps of limb_5 are 3.00 s off the others'" in told.message

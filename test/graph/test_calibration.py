@@ -28,7 +28,7 @@ def test_a_rig_is_calibrated_as_its_twin_is_in_one_process(
     graph, rig: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     rest = np.zeros((20, 2))
-    pressure = np.concatenate([rest, waves(10_000.0, 2, 18.0), rest])
+    pressure = np.concatenate([rest, waves(12_000.0, 2, 12.0), rest])
     table = tmp_path / "excitation.csv"
     write_excitation(Excitation(PERIOD * np.arange(len(pressure)), pressure), table)
     # A first guess far from the twin, so that only the data can bring both files together.

@@ -12,12 +12,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from diagnostic_msgs.msg import DiagnosticStatus
 from domain import own_domain
 
-from der_planner.experiment.console import Progress
-from der_planner.experiment.graph_run import RunningGraph
-from der_planner.experiment.processes import GraphError, find_executable
+from der_planner.experiment.processes import find_executable
 from der_planner.limb import DEFAULT_LIMB_FILE
 from der_planner.results import evaluate_run, load_run
 
@@ -175,39 +172,3 @@ def test_a_clock_that_is_off_on_the_other_computer_forbids_feedback_and_nothing_
         r"/limb/apriltag_tracker \+(\S+) ± (\S+) ms", played.extra["clocks"]
     ).groups()
     assert float(offset) == pytest.approx(33.0, abs=3.0 + float(uncertainty))
-
-
-class Silent:
-    """A client that hears nothing, or a node with other messages."""
-
-    def __init__(self, heard: bool) -> None:
-        self._heard = heard
-
-    def wait_ready(self, names: list[str], *_: float) -> None:
-        if not self._heard:
-            raise GraphError(f"node '{next(iter(names))}' was not ready")
-
-    def diagnostic_values(self, _: str) -> dict[str, str]:
-        return {"messages": "12345678"}
-
-
-@pytest.mark.parametrize(
-    ("heard", "told"),
-    [
-        (False, r"was not ready \(apriltag_tracker on camera-pc\).*ROS_DOMAIN_ID.*firewall"),
-        (True, r"on camera-pc has other messages \(12345678\).*same version"),
-    ],
-)
-def test_a_node_elsewhere_that_is_missing_or_of_another_version_is_named(heard: bool, told: str):
-    graph = RunningGraph(Silent(heard), Progress(), elsewhere={"apriltag_tracker": "camera-pc"})
-    with pytest.raises(GraphError, match=told):
-        graph._wait_elsewhere()
-
-
-def test_what_a_tracker_warns_of_is_said_before_it_is_played(capsys, tmp_path):
-    client = Silent(True)
-    client.diagnostics = {
-        "apriltag_tracker": DiagnosticStatus(level=DiagnosticStatus.WARN, message="another clock")
-    }
-    RunningGraph(client, Progress()).start([], tmp_path, {})
-    assert "warning: apriltag_tracker: another clock" in capsys.readouterr().err

@@ -10,7 +10,7 @@ import uuid
 
 import numpy as np
 import pytest
-from driver_bench import PERIOD, difference
+from driver_bench import PERIOD, Bench, difference
 from std_msgs.msg import Float64MultiArray
 
 from der_msgs.msg import PressureSetpoint, PressureState
@@ -21,8 +21,13 @@ from limb_interfaces.stamps import nanoseconds, stamp_from_nanoseconds
 pytestmark = pytest.mark.graph
 
 
-def test_a_run_from_arming_to_the_end_of_the_process(bench):
-    run = bench("native")
+@pytest.fixture(scope="module")
+def run(module_graph):
+    """A native board with a driver, for the tests below in their order."""
+    return Bench(module_graph, "native", accept_cmd_u_t=True)
+
+
+def test_a_run_from_arming_to_disarming(run):
     run.arm()
     count = len(run.play(24, lambda k: (200.0 * (k + 1), -100.0 * (k + 1))))
     # Setpoints stop: hold, ramp down, vented.
@@ -41,13 +46,9 @@ def test_a_run_from_arming_to_the_end_of_the_process(bench):
     ticks = [nanoseconds(s.header.stamp) for s in run.states]
     assert all(tick % PERIOD == 0 for tick in ticks)
     assert ticks == sorted(ticks)
-    assert run.driver.stop() == 0
-    assert run.board.stop() == 0
-    assert not os.path.lexists(run.link)
 
 
-def test_cmd_u_t_is_taken_in_hectopascal(bench):
-    run = bench(accept_cmd_u_t=True)
+def test_cmd_u_t_is_taken_in_hectopascal(run):
     run.arm()
     publisher = run.client.node.create_publisher(Float64MultiArray, "cmd_u_t", qos.SETPOINTS)
     run.wait(publisher.get_subscription_count, "the driver's subscription")
@@ -60,27 +61,35 @@ def test_cmd_u_t_is_taken_in_hectopascal(bench):
     assert run.states[-1].plan_id in ("", "cmd_u_t")
 
 
-def test_two_publishers_of_a_running_graph_are_not_mixed(bench):
+def test_two_publishers_of_a_running_graph_are_not_mixed_and_all_end_in_order(run):
     """Their numbers come from the middleware."""
-    run = bench()
+    run.client.call("pressure_driver/vent")
     run.arm()
+    run.commands.clear()
+    before = run.states[-1].setpoints_accepted
     other = run.client.node.create_publisher(
         PressureSetpoint, topics.PRESSURE_SETPOINT, qos.SETPOINTS
     )
     run.wait(other.get_subscription_count, "the subscription")
 
+    def publish(publisher, value):
+        publisher.publish(PressureSetpoint(plan_id="same", differential_pressure=[value, 0.0]))
+        run.client.spin(0.02)
+
     def both_heard():
-        run.publisher.publish(PressureSetpoint(differential_pressure=[3000.0, 0.0]))
-        run.client.spin(0.02)
-        if run.states[-1].setpoints_accepted > 20:  # far ahead: the two never count in step
-            other.publish(PressureSetpoint(differential_pressure=[-3000.0, 0.0]))
-        run.client.spin(0.02)
+        publish(run.publisher, 3000.0)
+        # Far ahead: the two never count in step.
+        if run.states[-1].setpoints_accepted > before + 20:
+            publish(other, -3000.0)
         told = run.client.diagnostic_values("pressure_driver")
         return int(told.get("setpoints_of_other_publishers", 0)) > 20
 
     run.wait(both_heard, "the count of refused setpoints")
     assert min(difference(command)[0] for command in run.commands) > -100.0
     assert "another publisher" in run.driver.log.read_text()
+    assert run.driver.stop() == 0
+    assert run.board.stop() == 0
+    assert not os.path.lexists(run.link)
 
 
 HANGING = """
@@ -128,8 +137,9 @@ def test_a_node_that_hangs_in_a_publication_delays_no_setpoint_that_has_arrived(
         modes = [state.mode for state in run.states[begin:]]
         assert PressureState.TRACKING in modes
         assert PressureState.FAULT not in modes
-        process.send_signal(signal.SIGINT)
+        process.send_signal(signal.SIGTERM)
         assert process.wait(60.0) == 0
+        run.wait(run.vented, "vented chambers")
 
 
 def test_a_lab_s_own_driver_is_played_and_vented_when_this_one_dies(graph):
@@ -178,23 +188,23 @@ def test_a_lab_s_own_driver_is_played_and_vented_when_this_one_dies(graph):
     os.kill(driver.pid, signal.SIGKILL)
     client.watch([board])
     client.wait_for(lambda: max(measured) < 0.1, 60.0, "the vented chambers")
+    assert "'pressure_driver' died (killed by SIGKILL)" in str(driver.failure("died"))
     assert board.stop() == 0
 
 
 # ------------------------------------------------------------------------------- how nodes end
 
 
-def test_every_exit_vents(bench):
-    """Also that with a closed terminal, where SIGHUP comes and nothing can be written any more."""
+def test_a_closed_terminal_and_a_crash_vent(bench):
+    """Where a terminal is closed, SIGHUP comes and nothing can be written any more."""
     run = bench()
-    for end in (signal.SIGTERM, signal.SIGHUP, "crash"):
+    for end in ("hang-up", "crash"):
         with run.other_driver(HANGING) as process:
             run.pressurise()
             if end == "crash":
                 run.publisher.publish(PressureSetpoint(plan_id="crash"))
             else:
-                process.send_signal(end)
-            if end == signal.SIGHUP:
+                process.send_signal(signal.SIGHUP)
                 process.stderr.close()
             run.wait(lambda process=process: process.poll() is not None, "the end of the driver")
             assert process.returncode == (end == "crash")

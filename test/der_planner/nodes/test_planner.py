@@ -1,7 +1,5 @@
 """The planner node as a process: plans, streams, hands over, stops, refuses with a reason."""
 
-from functools import partial
-
 import numpy as np
 import pytest
 from geometry_msgs.msg import PointStamped
@@ -78,11 +76,6 @@ class Planner:
         return [m for _, m in self.setpoints if m.plan_id == plan_id]
 
 
-@pytest.fixture
-def planner(graph):
-    return partial(Planner, graph)
-
-
 @pytest.fixture(scope="module")
 def running(module_graph):
     return Planner(module_graph)
@@ -100,15 +93,20 @@ def stamp(message):
     return nanoseconds(message.header.stamp)
 
 
-def test_a_command_becomes_a_plan_and_timed_setpoints(planner):
-    node = planner(payload=0.02, mounting="hanging")
+def test_a_command_becomes_a_plan_and_timed_setpoints_that_are_started_and_stopped(graph):
+    node = Planner(graph, payload=0.02, mounting="hanging", auto_start=False)
+    with pytest.raises(GraphError, match="no plan yet"):
+        node.client.call("planner/start")
     node.command(plan_id="first", method="optimal")
     plan = node.wait_plan("first")
     count = len(plan.time)
+    node.wait_state("done")
+    assert not node.setpoints
+    node.client.call("planner/start")
     assert (plan.model, plan.method, plan.segment_count) == ("der", "optimal", 2)
     assert (plan.payload, plan.payload_at, *plan.gravity) == (0.02, 0.0, 9.81, 0.0, 0.0)
     node.client.wait_for(lambda: len(node.received("first")) == count, 60.0, "the setpoints")
-    messages = node.received("first")
+    messages, plan = node.received("first"), node.plans[-1]
     assert [m.index for m in messages] == list(range(count))
     assert stamp(messages[0]) == stamp(plan)
     assert all(stamp(m) % 50_000_000 == 0 for m in messages)
@@ -126,22 +124,16 @@ def test_a_command_becomes_a_plan_and_timed_setpoints(planner):
     (offered,) = node.client.node.get_publishers_info_by_topic("/limb/pressure_setpoint")
     assert offered.qos_profile.liveliness_lease_duration == Duration(seconds=1)
 
-
-def test_start_and_stop(planner):
-    node = planner(auto_start=False)
-    with pytest.raises(GraphError, match="no plan yet"):
-        node.client.call("planner/start")
     node.command(plan_id="waits", period=30.0)
     plan = node.wait_plan("waits")
     node.wait_state("done")
-    assert not node.setpoints
     node.client.call("planner/start")
     node.client.wait_for(lambda: len(node.received("waits")) > 3, 60.0, "setpoints")
     with pytest.raises(GraphError, match="is being played"):
         node.client.call("planner/start")
     assert "stopped streaming" in node.client.call("planner/stop")
     node.wait_state("idle")
-    assert len(node.setpoints) < len(plan.time)
+    assert len(node.received("waits")) < len(plan.time)
     node.client.call("planner/start")
     node.wait_state("streaming")
     assert node.process.stop() == 0
@@ -186,52 +178,76 @@ def test_a_bad_command_leaves_the_plan_that_plays_alone(plain):
     node.client.call("planner/stop")
 
 
+class Driver:
+    """Stands in for the driver: tells its mode 20 times a second, until it is silenced."""
+
+    def __init__(self, node):
+        self.node, self.mode = node, PressureState.DISARMED
+        talker = node.client.node
+        driver = talker.create_publisher(PressureState, topics.PRESSURE_STATE, qos.STATES)
+
+        def tick():
+            state = PressureState(mode=self.mode)
+            state.header.stamp = talker.get_clock().now().to_msg()
+            driver.publish(state)
+
+        self.ticking = talker.create_timer(0.05, tick)
+        self.become("DISARMED")
+
+    def become(self, name):
+        """Change the mode, and wait until the planner has heard of it."""
+        self.mode = getattr(PressureState, name)
+        self.node.client.wait_for(lambda: self.node.state()["driver"] == name, 30.0, name)
+
+
 def test_a_plan_belongs_to_the_arming_in_which_it_was_asked_for(plain):
-    """Asked for while disarmed, by topic or action, it is refused at once and never plays.
-
-    So it is while the driver is silent.
-    """
-    node, client = plain, plain.client
-    mode = PressureState.DISARMED
-    driver = client.node.create_publisher(PressureState, topics.PRESSURE_STATE, qos.STATES)
-
-    def tick():
-        state = PressureState(mode=mode)
-        state.header.stamp = client.node.get_clock().now().to_msg()
-        driver.publish(state)
-
-    def hears(name):
-        client.wait_for(lambda: node.state()["driver"] == name, 30.0, f"the planner to hear {name}")
-
-    ticking = client.node.create_timer(0.05, tick)
-    hears("DISARMED")
+    """Asked for while disarmed, by topic or action, it is refused at once and never plays."""
+    node, driver = plain, Driver(plain)
     node.command(plan_id="early", period=60.0)
     node.wait_refusal("early: the driver is DISARMED")
     result = node.result_of(node.ask(period=60.0)[1])
     assert result.outcome == "refused"
     assert "DISARMED" in result.reason
 
-    mode = PressureState.ARMED
-    hears("ARMED")
+    driver.become("ARMED")
     node.command(plan_id="halted", period=600.0)  # it takes longer to plan than to disarm
-    client.wait_for(lambda: node.state()["plan_id"] == "halted", 30.0, "it to be planned")
-    mode = PressureState.FAULT
+    node.client.wait_for(lambda: node.state()["plan_id"] == "halted", 30.0, "it to be planned")
+    driver.mode = PressureState.FAULT
     node.wait_refusal("halted: the driver is in FAULT")
-    mode = PressureState.ARMED
-    hears("ARMED")
+    driver.become("ARMED")
     node.command(plan_id="later", period=2.0)
     node.wait_state("done")
     assert {message.plan_id for _, message in node.setpoints} == {"later"}
     assert {plan.plan_id for plan in node.plans} == {"later"}
+    driver.ticking.cancel()
 
-    node.command(plan_id="last", period=2.0)
-    node.wait_state("streaming")
-    ticking.cancel()
+
+def test_a_driver_that_vents_or_is_silent_is_sent_nothing_more(plain):
+    node, client, driver = plain, plain.client, Driver(plain)
+    driver.become("ARMED")
+    node.command(plan_id="old", period=30.0)
+    client.wait_for(lambda: node.received("old"), 60.0, "setpoints")
+    driver.mode = PressureState.DISARMED
+    node.wait_state("vented")
+    driver.become("ARMED")
+    node.wait_state("idle")
+    sent = len(node.received("old"))
+    node.command(plan_id="old")  # it needs another name
+    node.wait_refusal("give the command another plan_id")
+    client.call("planner/start")
+    again = client.wait_for(lambda: node.received("old-2"), 60.0, "the plan under a new name")
+    assert again[0].index == 0
+    assert node.plans[-1].plan_id == "old-2"
+
+    driver.ticking.cancel()
     node.wait_state("lost")
     node.command(plan_id="silent", period=600.0)
     node.wait_refusal("silent: the driver has said nothing for")
+    sent_again = len(node.received("old-2"))
     result = node.result_of(node.ask(period=60.0)[1])
     assert result.outcome == "refused"
+    client.spin(1.0)
+    assert (len(node.received("old")), len(node.received("old-2"))) == (sent, sent_again)
     log = node.process.log.read_text()
     assert "plan silent accepted" not in log
     assert f"plan {result.plan_id} accepted" not in log

@@ -5,8 +5,6 @@ import threading
 import numpy as np
 import pytest
 
-pytestmark = pytest.mark.graph
-
 
 def test_pictures_from_the_future_are_left_out_and_named_once():
     from der_msgs.msg import LimbState
@@ -125,6 +123,7 @@ def test_a_touch_is_published_and_drawn_while_it_lasts():
     assert sent[topics.SHAPE_MARKERS].markers[0].action == Marker.DELETE
 
 
+@pytest.mark.slow
 def test_solutions_that_take_too_long_never_hold_up_the_plan():
     """Every command comes too late: setpoints go out meanwhile, and then the plan is left alone."""
     from der_msgs.msg import LimbState

@@ -1,0 +1,60 @@
+"""What the orchestrator says of nodes elsewhere, and how it vents after an error."""
+
+from __future__ import annotations
+
+from unittest.mock import Mock
+
+import pytest
+from diagnostic_msgs.msg import DiagnosticStatus
+
+from der_planner.experiment.console import Progress
+from der_planner.experiment.graph_run import PORT_VENTS, RunningGraph
+from der_planner.experiment.processes import GraphError
+
+
+@pytest.mark.parametrize("alive", [True, False])
+def test_a_living_driver_vents_and_the_port_of_a_dead_one_is_given_time(alive: bool, capsys):
+    client = Mock()
+    client.call.side_effect = GraphError("no answer")
+    driver = Mock(alive=alive)
+    RunningGraph(client, Progress(), processes={"pressure_driver": driver}).vent_after_error()
+    assert [call.args for call in client.call.call_args_list] == [("pressure_driver/vent",)] * alive
+    assert [call.args for call in client.spin.call_args_list] == [(PORT_VENTS,)] * (not alive)
+    warned = "may still be under pressure (no answer); close its air supply"
+    assert (warned in capsys.readouterr().err) == alive
+
+
+class Silent:
+    """A client that hears nothing, or a node with other messages."""
+
+    def __init__(self, heard: bool) -> None:
+        self._heard = heard
+
+    def wait_ready(self, names: list[str], *_: float) -> None:
+        if not self._heard:
+            raise GraphError(f"node '{next(iter(names))}' was not ready")
+
+    def diagnostic_values(self, _: str) -> dict[str, str]:
+        return {"messages": "12345678"}
+
+
+@pytest.mark.parametrize(
+    ("heard", "told"),
+    [
+        (False, r"was not ready \(apriltag_tracker on camera-pc\).*ROS_DOMAIN_ID.*firewall"),
+        (True, r"on camera-pc has other messages \(12345678\).*same version"),
+    ],
+)
+def test_a_node_elsewhere_that_is_missing_or_of_another_version_is_named(heard: bool, told: str):
+    graph = RunningGraph(Silent(heard), Progress(), elsewhere={"apriltag_tracker": "camera-pc"})
+    with pytest.raises(GraphError, match=told):
+        graph._wait_elsewhere()
+
+
+def test_what_a_tracker_warns_of_is_said_before_it_is_played(capsys, tmp_path):
+    client = Silent(True)
+    client.diagnostics = {
+        "apriltag_tracker": DiagnosticStatus(level=DiagnosticStatus.WARN, message="another clock")
+    }
+    RunningGraph(client, Progress()).start([], tmp_path, {})
+    assert "warning: apriltag_tracker: another clock" in capsys.readouterr().err
