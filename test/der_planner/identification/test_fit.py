@@ -1,5 +1,6 @@
 """Fits on logs whose truth is known, and logs that must be refused."""
 
+import weakref
 from dataclasses import replace
 
 import numpy as np
@@ -7,10 +8,10 @@ import pytest
 from limbs import with_segments
 
 from der_planner.identification import CalibrationLog, LogError, check, fit, predict
-from der_planner.identification.bends import NODES, Predicted, follow
+from der_planner.identification.bends import NODES, BendFit, Predicted, follow
 from der_planner.identification.excitation import calibration_run, steps, sweep, waves
 from der_planner.identification.lengths import fit_geometry, lengths_of, with_lengths
-from der_planner.identification.log import Prepared
+from der_planner.identification.log import Prepared, prepare
 from der_planner.identification.terms import COLUMN, TERMS, FreeTerms, values_of
 from der_planner.limb import Limb
 from der_planner.model import Material, RodModel
@@ -99,6 +100,15 @@ def test_derivatives_agree_with_differences(log):
         # too; a cubic term acts where the rod bends, its derivative evenly over the segment.
         tolerance = {"dynamics": 0.2, "mass": 0.2, "cubic": 0.05}.get(term.group, 0.02)
         assert np.abs(exact[:, :, place] - difference).max() < tolerance * scale, term.name
+
+
+def test_a_fit_is_gone_with_its_last_reader(log):
+    free = FreeTerms.of(hidden_limb(), {"gain"})
+    problem = BendFit(free, RodModel(free.limb, NODES), [prepare(log, free.limb)])
+    assert problem.search.follows(free.unknowns.prior)
+    gone = weakref.ref(problem)
+    del problem
+    assert gone() is None  # its predictions are hundreds of megabytes
 
 
 def test_a_swing_lets_go_of_friction_while_a_segment_waits():

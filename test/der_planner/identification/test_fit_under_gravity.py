@@ -64,7 +64,7 @@ def test_a_chain_held_sideways_that_swings_and_carries_a_mass_is_fitted():
     # the stiffness and a rest angle that was off by 12°.
     first, known = limb.segments[0], report.value("log_stiffness[0]")
     truth = 0.122 / np.sum(1.0 / chain._stiffness[:7])
-    assert known.deviation < 0.08
+    assert known.deviation < 0.09
     assert first.bending_stiffness == pytest.approx(truth, rel=0.12)
     assert f"{np.exp(known.value):.3f} × the prior's" in report.text()
     rest = first.rest_curvature * first.length
@@ -110,7 +110,7 @@ def test_tips_tell_how_much_of_a_bend_is_the_weights():
 
     def rows(change: float) -> tuple[np.ndarray, np.ndarray]:
         residual, slopes = tips.rows(Predicted(stiffness, other, log, np.array([0.0, change])))
-        return residual, slopes()
+        return residual[:-4], slopes()[:-4]  # the last ones are what is known of the lengths
 
     own = np.linalg.norm(rows(0.0)[0])
     assert np.linalg.norm(rows(-0.3)[0]) > 2.5 * own

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from itertools import compress
 
 import numpy as np
@@ -207,9 +207,10 @@ class BendFit:
         logs: Sequence[Prepared],
         more_rows: Callable[[Predicted], Rows] | None = None,
     ) -> None:
-        self.free, self._model, self._logs, self._more_rows = free, model, logs, more_rows
-        # A search comes back to its best values after steps that led to nothing better.
-        self._kept = lru_cache(maxsize=8)(self._predict)
+        self.free, self._logs, self._more_rows = free, logs, more_rows
+        # A search comes back to its best values after steps that led to nothing better. What is
+        # kept must not know this fit: the two would hold each other, and 200 MB, in memory.
+        self._kept = lru_cache(maxsize=3)(partial(_predicted, free, model, logs))
         self._bends_on = [_bends_on(free.limb, log) for log in logs]
         self._shaken = [_shaken(free.limb, log) for log in logs]
         self.weigh(np.full((3, free.limb.segment_count), ANGLE_ERROR))
@@ -220,8 +221,11 @@ class BendFit:
         self.errors = np.maximum(errors, 1e-3 * ANGLE_ERROR)
         self.errors[2] = np.maximum(errors[2], SHAKEN_WORSE * errors[0])
         self._weighed = True
-        unknowns = self.free.unknowns
-        self.search = LeastSquares(unknowns, self._rows, SOFTNESS / np.sqrt(CORRELATION))
+
+    @property
+    def search(self) -> LeastSquares:
+        """The search for the unknowns by the weights of now."""
+        return LeastSquares(self.free.unknowns, self._rows, SOFTNESS / np.sqrt(CORRELATION))
 
     def solve(self, start: Array, most: int = MOST_FITS) -> Array:
         """Return the best values (P,), the bend angles weighed by the errors that these leave.
@@ -253,10 +257,6 @@ class BendFit:
             RuntimeError: the model cannot follow the logs.
         """
         return self._kept(same_values(values, self.free.unknowns))
-
-    def _predict(self, key: bytes) -> list[Predicted]:
-        values = np.frombuffer(key) * self.free.unknowns.scale
-        return [Predicted(self.free, self._model, log, values) for log in self._logs]
 
     def _rows(self, values: Array) -> Rows | None:
         try:
@@ -360,6 +360,14 @@ class BendFit:
         information = table.T @ table + np.diag(np.append(0.0, known**2))
         covariance = np.linalg.pinv(information, hermitian=True)
         return float(covariance[0] @ table.T @ error), float(np.sqrt(covariance[0, 0]))
+
+
+def _predicted(
+    free: FreeTerms, model: Model, logs: Sequence[Prepared], key: bytes
+) -> list[Predicted]:
+    """Return what is predicted along logs at the values that `same_values` has named."""
+    values = np.frombuffer(key) * free.unknowns.scale
+    return [Predicted(free, model, log, values) for log in logs]
 
 
 def _apart(table: Array) -> tuple[Array, Array]:

@@ -37,9 +37,9 @@ TIP_ERROR = 1e-3
 """Error of the tip of a limb bent by `UNEVEN_BEND` or more [m]: a real one bends unevenly."""
 UNEVEN_BEND = 1.0
 """Bend from which on a tip has `TIP_ERROR`; below it the error falls to `STRAIGHT_ERROR` [rad]."""
-UNEVEN_ERROR = 2e-3
+UNEVEN_ERROR = 8e-3
 """Error of a tip where it tells stiffness [m]: what makes a limb bend unevenly beside its weight,
-fittings and uneven walls, stays the same for the whole log and averages out less."""
+fittings and uneven walls, is 1 mm, but stays the same for the whole log and never averages out."""
 FEWEST_TIPS = 20
 """Rows with tips that a log needs to tell lengths."""
 MOST_TIPS = 800
