@@ -145,7 +145,9 @@ class RunningGraph:
         self.client.wait_ready(self.processes)
         for name in ("apriltag_tracker", "pose_tracker"):
             status = self.client.diagnostics.get(name)
-            if status is not None and status.level == DiagnosticStatus.WARN:
+            # `check_clocks` says whose clock is off, once it is known well.
+            said_later = bool(self._offset(name).warning)
+            if status and status.level == DiagnosticStatus.WARN and not said_later:
                 self.progress.say(f"  warning: {name}: {status.message}")
         self.progress.say(f"  ready after {time.monotonic() - begin:.1f} s")
 
