@@ -25,6 +25,8 @@ WARNING = 1e-3
 """[s] of offset: more than a setpoint's stamp may be wrong by unnoticed."""
 LARGEST = 10e-3
 """[s] of offset with which feedback is not used: a limb moves by a millimetre meanwhile."""
+CLOCK_OFF = "the clock of this computer is"
+"""How a node begins to say that its clock is off the driver's."""
 _SECONDS = 1e-9
 
 
@@ -43,7 +45,7 @@ class Offset(NamedTuple):
             return ""
         side = "behind" if self.seconds > 0.0 else "ahead of"
         return (
-            f"the clock of this computer is {1e3 * abs(self.seconds):.1f} ms {side} the driver's "
+            f"{CLOCK_OFF} {1e3 * abs(self.seconds):.1f} ms {side} the driver's "
             f"(± {1e3 * self.uncertainty:.1f} ms): have both computers run chrony "
             "(docs/guide/two_computers.md)"
         )

@@ -10,6 +10,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from der_planner.experiment.console import Progress
 from der_planner.experiment.graph_run import PORT_VENTS, RunningGraph
 from der_planner.experiment.processes import GraphError
+from limb_interfaces.clocks import Offset
 
 
 @pytest.mark.parametrize("alive", [True, False])
@@ -51,10 +52,14 @@ def test_a_node_elsewhere_that_is_missing_or_of_another_version_is_named(heard: 
         graph._wait_elsewhere()
 
 
-def test_what_a_tracker_warns_of_is_said_before_it_is_played(capsys, tmp_path):
+@pytest.mark.parametrize(
+    ("message", "said"), [("another clock", True), (Offset(0.045, 0.02).warning, False)]
+)
+def test_what_a_tracker_warns_of_is_said_before_it_is_played(capsys, tmp_path, message, said):
     client = Silent(True)
-    client.diagnostics = {
-        "apriltag_tracker": DiagnosticStatus(level=DiagnosticStatus.WARN, message="another clock")
-    }
+    # Whose clock is off is said by what is known when the limb is armed.
+    client.diagnostic_values = lambda _: {"clock_offset_s": "0.045", "clock_uncertainty_s": "0.02"}
+    warned = DiagnosticStatus(level=DiagnosticStatus.WARN, message=message)
+    client.diagnostics = {"apriltag_tracker": warned}
     RunningGraph(client, Progress()).start([], tmp_path, {})
-    assert "warning: apriltag_tracker: another clock" in capsys.readouterr().err
+    assert (f"warning: apriltag_tracker: {message}" in capsys.readouterr().err) == said

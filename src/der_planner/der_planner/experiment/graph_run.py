@@ -31,7 +31,7 @@ from der_planner.experiment.processes import (
     board_line,
 )
 from limb_interfaces import qos, topics
-from limb_interfaces.clocks import LARGEST, Offset
+from limb_interfaces.clocks import CLOCK_OFF, LARGEST, Offset
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health, message_version
 
 DISCOVERY = 1.0
@@ -145,9 +145,9 @@ class RunningGraph:
         self.client.wait_ready(self.processes)
         for name in ("apriltag_tracker", "pose_tracker"):
             status = self.client.diagnostics.get(name)
-            # `check_clocks` says whose clock is off, once it is known well.
-            said_later = bool(self._offset(name).warning)
-            if status and status.level == DiagnosticStatus.WARN and not said_later:
+            if status is None or status.level != DiagnosticStatus.WARN:
+                continue
+            if CLOCK_OFF not in status.message:  # `check_clocks` says it, once it is known well
                 self.progress.say(f"  warning: {name}: {status.message}")
         self.progress.say(f"  ready after {time.monotonic() - begin:.1f} s")
 

@@ -146,8 +146,8 @@ class Predicted:
         except RuntimeError:  # beyond what the model can follow
             step = -step
             other = self._at(step)
-        length = step[place]
-        return (other.bend_angles - self.angles) / length, (other.tip - self.tip) / length
+        change = step[place]
+        return (other.bend_angles - self.angles) / change, (other.tip - self.tip) / change
 
     def _at(self, step: Array) -> Response | Rollout:
         limb, response = self._free.limb_with(self._values + step), self._response
@@ -210,7 +210,7 @@ class BendFit:
         self.free, self._logs, self._more_rows = free, logs, more_rows
         # A search comes back to its best values after steps that led to nothing better. What is
         # kept must not know this fit: the two would hold each other, and 200 MB, in memory.
-        self._kept = lru_cache(maxsize=3)(partial(_predicted, free, model, logs))
+        self._kept = lru_cache(maxsize=3)(partial(_predict, free, model, logs))
         self._bends_on = [_bends_on(free.limb, log) for log in logs]
         self._shaken = [_shaken(free.limb, log) for log in logs]
         self.weigh(np.full((3, free.limb.segment_count), ANGLE_ERROR))
@@ -362,7 +362,7 @@ class BendFit:
         return float(covariance[0] @ table.T @ error), float(np.sqrt(covariance[0, 0]))
 
 
-def _predicted(
+def _predict(
     free: FreeTerms, model: Model, logs: Sequence[Prepared], key: bytes
 ) -> list[Predicted]:
     """Return what is predicted along logs at the values that `same_values` has named."""

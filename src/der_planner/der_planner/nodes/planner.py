@@ -38,6 +38,8 @@ _ARMING_PATIENCE = 0.5
 """The state of a driver that was armed just now is waited for this long [s]."""
 _FEEDBACK_MARGIN = 500_000_000
 """Making feedback ready for a plan takes less than this [ns]."""
+_BY_DRIVER = ("vented", "fault", "lost")
+"""How a plan ends that the driver takes no more of."""
 
 
 class PlannerNode(Node):
@@ -81,7 +83,7 @@ class PlannerNode(Node):
         if ending is not None:
             self._streamer.abandon(ending)
             self._drop_request(ending, nanoseconds(message.header.stamp))
-        elif message.mode == message.ARMED and self._status.state in ("vented", "fault", "lost"):
+        elif message.mode == message.ARMED and self._status.state in _BY_DRIVER:
             self._status = Status("idle", self._status.plan_id)  # what ended the plan is over
         self._corrector.add_pressures(message)
 
@@ -348,7 +350,7 @@ class PlannerNode(Node):
         """Log how the playing of a plan ended, and tell who asked for it."""
         reason = "; ".join(filter(None, [self._corrector.forget(schedule), reason]))
         text = f"plan {schedule.plan_id} {outcome} after {self._streamer.share(schedule)}"
-        if outcome in ("vented", "fault", "lost"):
+        if outcome in _BY_DRIVER:
             # The driver takes nothing: plan nothing to go on with either.
             self.get_logger().error(f"{text}: {reason}")
             self._end_all(outcome, reason)
