@@ -189,6 +189,7 @@ def _default(value: Any) -> str:
 def _fit(term: Term | None) -> str:
     if term is None:
         return ""
+    term = term.at_limit(Limb.default().pneumatics.pressure_limit)
     name = f"relative, `{term.name}`" if term.relative else f"`{term.name}`"
     unit = "" if term.unit == "-" else f" {term.unit}"
     spread = f", ± {term.spread:g}" if term.spread < float("inf") else ""

@@ -18,6 +18,19 @@ def with_segments(limb, **changes):
     return replace(limb, segments=tuple(replace(s, **changed(s)) for s in limb.segments))
 
 
+def of_pressures(limb: Limb, factor: float) -> Limb:
+    """Return a limb that does the same under pressures larger by a factor."""
+    air = limb.pneumatics
+    vent_rate = air.vent_rate * factor ** (1.0 - air.vent_exponent)
+    limits = {key: factor * getattr(air, key) for key in ("pressure_limit", "slew_limit")}
+    limb = replace(limb, pneumatics=replace(air, vent_rate=vent_rate, **limits))
+    return with_segments(
+        limb,
+        moment_gain=lambda s: s.moment_gain / factor,
+        pressure_stiffening=lambda s: s.pressure_stiffening / factor,
+    )
+
+
 def other_limb(gain=0.9, rest=0.035) -> Limb:
     """Return the default limb with a share of its gain and another angle at rest [rad]."""
     return with_segments(

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from limbs import of_pressures
 from link_chain import LinkChain
 
 from der_planner.control import Feedback, Learner
@@ -19,18 +20,21 @@ LENGTH = 0.244
 
 
 class Chain:
-    """A chain of links as a plant; what it feels may be changed on the way."""
+    """A chain of links as a plant; what it feels may be changed on the way.
 
-    def __init__(self, seed: int = 3) -> None:
-        self.chain = LinkChain(seed)
+    All its pressures may be larger by a factor.
+    """
+
+    def __init__(self, seed: int = 3, pressures: float = 1.0) -> None:
+        self.chain, self._factor = LinkChain(seed), pressures
         self._seen = self.chain.reset()
 
     def advance(self, command: np.ndarray, duration: float) -> None:
-        self._seen = self.chain.advance(command, duration)
+        self._seen = self.chain.advance(command / self._factor, duration)
 
     @property
     def differential_pressure(self) -> np.ndarray:
-        return self._seen.differential_pressure
+        return self._factor * self._seen.differential_pressure
 
     @property
     def bend_angles(self) -> np.ndarray:
@@ -73,6 +77,20 @@ def test_a_limb_that_was_never_calibrated_is_followed(planned, corrected):
     assert played.error[after].mean() < 0.012 * LENGTH
     assert played.error[after].mean() < 0.6 * alone.error[after].mean()
     assert not feedback.warnings
+
+
+@pytest.mark.parametrize("factor", [0.2, 12.0])
+def test_a_limb_of_other_pressures_is_corrected_alike(planned, corrected, factor):
+    played, feedback, _ = corrected
+    motion = Motion.named("asynchronous", period=12.0, cycles=1)
+    alike = plan(of_pressures(planned.limb, factor), motion)
+    alike_feedback = Feedback(alike)
+    sensors = Sensors(pressure_noise=factor * Sensors().pressure_noise)
+    found = play(alike, Chain(pressures=factor), alike_feedback, sensors)
+    np.testing.assert_allclose(alike.tip_predicted, planned.tip_predicted, atol=2e-5)
+    np.testing.assert_allclose(found.correction / factor, played.correction, atol=50.0)
+    np.testing.assert_allclose(found.tip, played.tip, atol=2e-4)
+    assert alike_feedback.touch.distance == pytest.approx(feedback.touch.distance, abs=0.02)
 
 
 def test_commands_keep_all_limits(planned, corrected):

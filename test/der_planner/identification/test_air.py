@@ -46,7 +46,7 @@ def test_lag_of_the_air_is_recovered():
     air = replace(AIR, time_constant=0.32, vent_time_constant=0.14, delay=0.0)
     command = waves(12_000.0, 2, 60.0)
     log = synthetic_log(air, command, noise=0.0)
-    found = fit_air(replace(log, measured_differential=log.measured_differential + 7.0))
+    found = fit_air(replace(log, measured_differential=log.measured_differential + 7.0), AIR)
     assert found.numbers["time_constant"] + found.numbers["delay"] == pytest.approx(0.32, abs=0.02)
     assert found.numbers["vent_time_constant"] + found.numbers["delay"] == pytest.approx(
         0.14, abs=0.02
@@ -59,7 +59,7 @@ def test_lag_of_the_air_is_recovered():
 def test_law_of_venting_is_recovered_within_its_uncertainty(rate, exponent):
     air = replace(AIR, vent_rate=rate, vent_exponent=exponent)
     command = np.concatenate([waves(14_000.0, 2, 40.0), steps(7_000.0)])
-    found = fit_air(synthetic_log(air, command))
+    found = fit_air(synthetic_log(air, command), AIR)
     of_rate, of_exponent = (found.deviations[n] for n in ("vent_rate", "vent_exponent"))
     assert abs(found.numbers["vent_rate"] - rate) < 4 * of_rate + 0.01 * rate
     assert abs(found.numbers["vent_exponent"] - exponent) < 4 * of_exponent + 0.01
@@ -71,11 +71,11 @@ def test_a_valve_that_opens_in_proportion_to_its_error_is_recognised():
     valve = {"vent_rate": 5000.0, "vent_exponent": 0.5, "vent_time_constant": 0.3}
     air = replace(AIR, vent_lag_exponent=0.5, **valve)
     command = np.concatenate([waves(14_000.0, 2, 40.0), steps(7_000.0)])
-    found = fit_air(synthetic_log(air, command))
+    found = fit_air(synthetic_log(air, command), AIR)
     assert found.numbers["vent_lag_exponent"] == pytest.approx(0.5, abs=0.05)
     assert found.numbers["vent_time_constant"] == pytest.approx(0.3, abs=0.03)
     assert found.residual < 15.0
-    one_lag = fit_air(synthetic_log(replace(air, vent_lag_exponent=0.0), command))
+    one_lag = fit_air(synthetic_log(replace(air, vent_lag_exponent=0.0), command), AIR)
     assert one_lag.numbers["vent_lag_exponent"] == 0.0
     assert one_lag.numbers["vent_time_constant"] == pytest.approx(0.3, abs=0.03)
 
@@ -84,7 +84,7 @@ def test_a_vented_step_of_the_emulated_board_is_predicted():
     """Whose law has chambers of their own, dead bands and coupled neighbours besides."""
     amplitude = 0.7 * Limb.default().pneumatics.pressure_limit
     run = calibration_run(amplitude, quick=True).differential_pressure
-    found = fit_air(emulated_log(4, run))
+    found = fit_air(emulated_log(4, run), AIR)
     assert found.numbers["vent_exponent"] == pytest.approx(emulator.VENT_EXPONENT, abs=0.06)
     command = np.zeros((240, 2))
     command[20:120] = (7_000.0, -14_000.0)

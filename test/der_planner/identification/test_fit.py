@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from limbs import with_segments
+from limbs import of_pressures, with_segments
 
 from der_planner.identification import CalibrationLog, LogError, check, fit, predict
 from der_planner.identification.bends import NODES, BendFit, Predicted, follow
@@ -145,6 +145,19 @@ def test_known_parameters_are_recovered_within_their_uncertainty(fitted):
             assert abs(item.value - true) < 4 * spread, (name, item, true)
     assert np.degrees(report.residual).max() < 0.4
     assert report.value("gain[0]").deviation < 0.03 * report.value("gain[0]").value
+
+
+@pytest.mark.parametrize("factor", [0.2, 12.0])
+def test_a_limb_of_other_pressures_is_found_alike(log, fitted, factor):
+    pressures = {
+        key: factor * getattr(log, key)
+        for key in ("commanded_differential", "measured_differential")
+    }
+    limb, report = fit(of_pressures(DAMPED, factor), replace(log, **pressures))
+    expected = values_of(of_pressures(fitted[0], factor))
+    np.testing.assert_allclose(values_of(limb), expected, rtol=0.01, atol=1e-3)
+    assert report.residual == pytest.approx(fitted[1].residual, rel=1e-3)
+    assert report.warnings == fitted[1].warnings
 
 
 def test_a_limb_that_fits_passes_the_check_and_a_changed_one_does_not(fitted):

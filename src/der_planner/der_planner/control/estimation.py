@@ -43,12 +43,14 @@ EARLIEST = 2.0
 """The limb is watched from so long before the first setpoint on [s]."""
 _NOISE = (2e-3, 3e-4)
 """Deviation of a measured bend angle [rad] and tip [m] whose covariance is not given."""
-_FIRST = (0.03, 0.03, 600.0, 0.15, 3e-3)
-"""Deviation of δθ [rad], δθ̇ [rad/s], d [Pa], g and b [m] before the first measurement."""
-_PRESSURE_DENSITY = 15.0
-"""Density of the effective pressure that is white noise [Pa √s]."""
-MISSING_DENSITY = 250.0
-"""Density with which d wanders [Pa/√s]."""
+_FIRST = (0.03, 0.03, 0.025, 0.15, 3e-3)
+"""Deviation of δθ [rad], δθ̇ [rad/s], d, g and b [m] before the first measurement.
+
+Pressures here are shares of the limb's pressure limit."""
+_PRESSURE_DENSITY = 6.25e-4
+"""Density of the effective pressure that is white noise [√s]."""
+MISSING_DENSITY = 0.0104
+"""Density with which d wanders [1/√s]."""
 _GAIN_DENSITY = 0.01
 """Density with which g wanders [1/√s]."""
 _TIP_DENSITY = 4e-4
@@ -61,7 +63,7 @@ _STRANGE = 6.0
 """Squared distance per coordinate from where a measurement counts less."""
 _STRANGEST = 200.0
 """Largest squared distance per coordinate with which one picture counts in their smoothed value."""
-_EVENT = (0.0, 0.5, 1000.0, 0.05, 0.0)
+_EVENT = (0.0, 0.5, 0.042, 0.05, 0.0)
 """What an event adds to the deviation of δθ, δθ̇ [rad/s], d [Pa], g and b."""
 
 
@@ -78,7 +80,7 @@ class Estimator:
     Args:
         nominal: the model's motion under the plan.
         chambers: their commands and readings.
-        missing_density: with which d wanders [Pa/√s].
+        missing_density: with which d wanders, over the pressure limit [1/√s].
         history: states and measurements are kept for this long [s].
 
     Attributes:
@@ -232,13 +234,17 @@ class Estimator:
 
     def beginning(self, first: int) -> Knowledge:
         """Return the prior state at fine step ``first``, before anything was measured."""
-        inputs = self.inputs
-        deviation = np.repeat(_FIRST, [inputs, inputs, inputs, inputs, 2])
+        inputs, deviation = self.inputs, self._deviations(_FIRST)
         zero = np.zeros(inputs)
         here = self.nominal.steps(first)
         memory = Memory(self.nominal.fine_bend[here], zero, zero)
         mean, effective = np.zeros(4 * inputs + 2), self.nominal.effective[here]
         return Knowledge(mean, np.diag(deviation**2), zero, memory, zero, effective)
+
+    def _deviations(self, parts: tuple[float, ...]) -> Array:
+        """Return the deviations (4M + 2,) of the state from those of its parts, d in Pa."""
+        units = [1.0, 1.0, self.nominal.model.air.pneumatics.pressure_limit, 1.0, 1.0]
+        return np.repeat(np.multiply(parts, units), [*[self.inputs] * 4, 2])
 
     def _forget(self, j: int) -> None:
         """Compute again from boundary ``j`` on."""
@@ -310,16 +316,15 @@ class Estimator:
         """
         nominal, inputs = self.nominal, self.inputs
         size, swing = 4 * inputs + 2, 2 * inputs
+        limit = nominal.model.air.pneumatics.pressure_limit
         moves = np.tile(np.eye(size), (nominal.count, 1, 1))
         moves[:, :swing, :swing] = nominal.fine_transition
         moves[:, :swing, swing : swing + inputs] = nominal.fine_input
         moves[:, -2:, -2:] *= math.exp(-STEP / _TIP_TIME)
-        wander = np.repeat(
-            [0.0, missing_density, _GAIN_DENSITY, _TIP_DENSITY], [swing, inputs, inputs, 2]
-        )
+        wander = self._deviations((0.0, 0.0, missing_density, _GAIN_DENSITY, _TIP_DENSITY))
         noises = np.tile(np.diag(wander**2 * STEP), (nominal.count, 1, 1))
-        push = nominal.fine_input
-        noises[:, :swing, :swing] += push @ np.swapaxes(push, 1, 2) * (_PRESSURE_DENSITY**2 / STEP)
+        push = limit * _PRESSURE_DENSITY * nominal.fine_input
+        noises[:, :swing, :swing] += push @ np.swapaxes(push, 1, 2) / STEP
         return moves, noises
 
     def _remember(self, known: Knowledge, bend: Array) -> tuple[Memory, Array]:
@@ -359,9 +364,7 @@ class Estimator:
         row = known.row + 1 if distance > _STRANGE else 0
         if row >= 2:
             # Once may be a bad picture, twice is the limb: a push, a load, a gain that fell.
-            spread = spread + np.diag(
-                np.repeat(np.square(_EVENT), [inputs, inputs, inputs, inputs, 2])
-            )
+            spread = spread + np.diag(self._deviations(_EVENT) ** 2)
             expected = rows @ spread @ rows.T + noise
             row = 0
         elif row:

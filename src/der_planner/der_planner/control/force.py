@@ -26,12 +26,13 @@ from der_planner.control.free_level import Lacking
 from der_planner.model import RodModel
 from der_planner.model.compliance import compliance
 
-_LARGEST_FORCE = 2.0
-"""Standard deviation of the forces across the limb that are expected [N]."""
+_LARGEST_FORCE = 2.3
+"""Standard deviation of the forces across the limb that are expected, over what the largest moment
+of its pressures makes at its length."""
 _RUBS = 0.3
 """Standard deviation of a force along the limb, over the force across it at the same place."""
-_LEAST_ALONG = 0.01
-"""Force along the limb that is expected anyway, a standard deviation [N]."""
+_LEAST_ALONG = 0.012
+"""The same of a force along the limb that is expected anyway."""
 EFFECT_WRONG = 0.1
 """Standard deviation of what a weight or a force is said to do, over that."""
 _UNEVEN = 0.02
@@ -106,9 +107,12 @@ def locate(model: RodModel, lacking: Lacking, places: Array) -> Touch:
     weight = np.linalg.inv(lacking.doubtful + np.diag(doubt**2))
     seen = np.swapaxes(effect, 1, 2) @ weight
     square, pull = seen @ effect, seen @ lacking.value
-    across = pull[:, 1] / (square[:, 1, 1] + 1.0 / _LARGEST_FORCE**2)
-    expected = np.full_like(pull, _LARGEST_FORCE)
-    expected[:, 0] = _LEAST_ALONG + _RUBS * np.abs(across)
+    limb = model.limb
+    gain = max(segment.moment_gain for segment in limb.segments)
+    usual = gain * limb.pneumatics.pressure_limit / limb.length
+    across = pull[:, 1] / (square[:, 1, 1] + (_LARGEST_FORCE * usual) ** -2)
+    expected = np.full_like(pull, _LARGEST_FORCE * usual)
+    expected[:, 0] = _LEAST_ALONG * usual + _RUBS * np.abs(across)
     told = square + (expected**-2.0)[:, :, None] * np.eye(2)
     forces = np.linalg.solve(told, pull[..., None])[..., 0]
     left = lacking.value @ weight @ lacking.value - (pull * forces).sum(axis=1)

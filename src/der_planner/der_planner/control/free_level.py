@@ -22,12 +22,14 @@ from der_planner.arrays import Array
 from der_planner.control.knowledge import Knowledge
 from der_planner.limb import Limb
 
-_FREE_LEVEL = 250.0, 2e-3
-"""Standard deviations of c, of a limb that nothing is known of yet [Pa], and of the tip [m]."""
-_FREE_NOISE = 110.0, 2e-4
+_FREE_LEVEL = 0.0104, 2e-3
+"""Standard deviations of c, of a limb that nothing is known of yet, as a share of its pressure
+limit, and of the tip [m]."""
+_FREE_NOISE = 0.0046, 2e-4
 """The same of e and noise together."""
-_FREE_GAIN, _FREE_COUPLING, _FREE_TIP = 0.07, 0.03, 1e-7
-"""The same of γ by a segment's own pressure and by that of another, and of the tip [m/Pa]."""
+_FREE_GAIN, _FREE_COUPLING, _FREE_TIP = 0.07, 0.03, 2.4e-3
+"""The same of γ by a segment's own pressure and by that of another, and of the tip at the pressure
+limit [m]."""
 _FREE_STIFFNESS, _FREE_TIP_BENT = 0.08, 1e-3
 """The same of κ, over the segment's stiffness, and of the tip [m/rad]."""
 _FREE_FRICTION = 0.15
@@ -160,9 +162,12 @@ class FreeLevel:
 
     def __init__(self, limb: Limb) -> None:
         self.payload = 0.0
-        inputs = limb.segment_count
-        level, noise = (np.repeat(each, [inputs, 2]) for each in (_FREE_LEVEL, _FREE_NOISE))
-        slope = np.full((inputs + 2, inputs), _FREE_TIP)
+        inputs, limit = limb.segment_count, limb.pneumatics.pressure_limit
+        self._level, noise = (
+            np.repeat([limit * pressure, tip], [inputs, 2])
+            for pressure, tip in (_FREE_LEVEL, _FREE_NOISE)
+        )
+        slope = np.full((inputs + 2, inputs), _FREE_TIP / limit)
         slope[:inputs] = _FREE_COUPLING + (_FREE_GAIN - _FREE_COUPLING) * np.eye(inputs)
         bent = np.zeros_like(slope)
         if limb.weighs_in_plane:
@@ -170,7 +175,7 @@ class FreeLevel:
             bent[:inputs], bent[inputs:] = _FREE_STIFFNESS * np.diag(stiffness), _FREE_TIP_BENT
         friction, uneven = _friction(limb)
         rubs = np.vstack([_FREE_FRICTION * np.diag(friction), uneven, uneven])
-        known = np.column_stack([level, slope, bent, rubs, np.zeros(len(level))])
+        known = np.column_stack([self._level, slope, bent, rubs, np.zeros(inputs + 2)])
         self._mean = np.zeros_like(known)
         self._covariance = known[:, :, None] ** 2 * np.eye(known.shape[1])
         self.noise = noise**2
@@ -181,7 +186,7 @@ class FreeLevel:
         """Return what is known of the limb in its next run: it may rest and be loaded otherwise."""
         after = copy.deepcopy(self)
         after.payload = 0.0
-        after._covariance[:, 0, 0] += np.repeat(_FREE_LEVEL, [len(self.noise) - 2, 2]) ** 2
+        after._covariance[:, 0, 0] += self._level**2
         return after
 
     def expected(self, lacking: Lacking, ahead: float = 0.0) -> tuple[Array, Array]:

@@ -18,8 +18,9 @@ from der_planner.control.touch import TouchSense
 from der_planner.model import CONTROL_PERIOD, STEPS
 from der_planner.planning.plan_file import Plan
 
-_SLOW = 100.0
-"""Density with which the pressure that the model lacks wanders in hindsight [Pa/√s].
+_SLOW = 0.0042
+"""Density with which the pressure that the model lacks wanders in hindsight, over the limb's
+pressure limit [1/√s].
 
 It is less than feedback reckons with, so that a gain that is lower shows as a gain.
 """

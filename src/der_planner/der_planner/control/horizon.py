@@ -39,10 +39,10 @@ _KNOTS = (0, 1, 2, 3, 5, 7, 10, 14, 19, 25, 32, 40, 50, 69)
 """Control periods at which corrections are free; the last one is the horizon's."""
 _BEND = 0.004
 """ν, tip error that a unit deviation of a bend is worth [m/rad]."""
-_CHANGE = 5e-6
-"""λ, tip error that a unit change of a correction is worth [m/Pa]."""
-_CHANGE_LEARNED = 2e-5
-"""λ on a learned plan, which makes up for what repeats, so that corrections may be slow [m/Pa]."""
+_CHANGE = 0.12
+"""λ, tip error that a change of a correction by the pressure limit is worth [m]."""
+_CHANGE_LEARNED = 0.48
+"""λ on a learned plan, which makes up for what repeats, so that corrections may be slow [m]."""
 _BACK = 20
 """Control periods within which the slew limit must let commands come back to the plan: where that
 fills or vents as fast as it may, a correction that stays makes the limb late."""
@@ -92,6 +92,7 @@ class Horizon:
         self._hats = _hats(_KNOTS)
         self._guess: tuple[int, Array] | None = None
         weight, each = _CHANGE_LEARNED if nominal.is_learned else _CHANGE, np.eye(self.window + 2)
+        weight /= self._air.pneumatics.pressure_limit
         # First and second differences of r, from two periods before the horizon on.
         self._changes = weight * np.concatenate([np.diff(each, axis=0)[1:], np.diff(each, 2, 0)])
         self._knot_changes = np.kron(self._changes[:, 2:] @ self._hats, np.eye(inputs))

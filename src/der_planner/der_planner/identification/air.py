@@ -21,8 +21,13 @@ from der_planner.limb import Limb, Pneumatics
 from der_planner.model import CONTROL_PERIOD as PERIOD
 from der_planner.model.air import Air
 
-SMOOTH_RATE = 6000.0
-"""Rate from which on a change of a command is a step [Pa/s]: its flow is choked, not a lag."""
+SMOOTH_RATE = 0.25
+"""Rate from which on a change of a command is a step, over the pressure limit [1/s]: its flow is
+choked, not a lag."""
+STEP = 0.125
+"""Change of a command in a control period that shows the fill rate, over the pressure limit."""
+MOVES = 0.0083
+"""Rate from which on a command shows the lag, over the pressure limit [1/s]."""
 STEP_MEMORY = 3.0
 """Time after such a step that nothing is fitted to [s]."""
 SHOWN = {"vent_rate": 0.25, "vent_exponent": 0.15}
@@ -34,9 +39,8 @@ VALVE_BETTER = 0.85
 """Share of the residual of one lag that a lag which changes with the pressure may leave."""
 _NUDGE = 0.02
 """Change of a number for a slope, in its scale."""
-SOFTNESS = 50.0
-"""Errors beyond this count less than their square [Pa]."""
-
+SOFTNESS = 0.0021
+"""Errors beyond this share of the pressure limit count less than their square."""
 
 _NUMBERS = {
     "time_constant": (0.2, 0.005, 1.5, 0.1),
@@ -75,11 +79,12 @@ class AirFit:
         return replace(prior, **self.numbers)
 
 
-def fit_air(log: CalibrationLog) -> AirFit:
+def fit_air(log: CalibrationLog, prior: Pneumatics) -> AirFit:
     """Fit the chambers' lag and venting to a log on the grid of the control period.
 
     The law is that of `der_planner.model.air`. A log whose chambers always follow their
-    commands shows the lag alone; venting is then left open.
+    commands shows the lag alone; venting is then left open. The prior says what a limb's pressures
+    are like.
 
     Raises:
         LogError: the commands hold no smooth motion, or pressures were not measured.
@@ -90,15 +95,16 @@ def fit_air(log: CalibrationLog) -> AirFit:
     offset = np.nanmean(rest, axis=0) if len(rest) else np.zeros(command.shape[1])
     offset = np.nan_to_num(offset)
     known = np.isfinite(measured) & (np.abs(measured - offset) > 0.0)
-    smooth = known & _after_no_step(command)
-    moving = np.abs(np.gradient(command, PERIOD, axis=0)) > 200.0
+    limit = prior.pressure_limit
+    smooth = known & _after_no_step(command, SMOOTH_RATE * limit)
+    moving = np.abs(np.gradient(command, PERIOD, axis=0)) > MOVES * limit
     if np.count_nonzero(smooth & moving) < 3.0 / PERIOD:
         raise LogError(
             "the commands hold less than 3 s of smooth motion: the chambers' lag cannot be told; "
             "record the calibration run, or a plan"
         )
-    falling = known & _after_no_step(np.abs(command), rising=True)
-    lags = _Chambers(command, measured - offset, smooth)
+    falling = known & _after_no_step(np.abs(command), SMOOTH_RATE * limit, rising=True)
+    lags = _Chambers(command, measured - offset, smooth, SOFTNESS * limit)
     venting = replace(lags, rows=falling)
     found, slow = lags.fit(_LAGS), venting.fit(_VENTING)
     alone = float(np.sqrt(np.mean(venting.residual(found.numbers) ** 2)))
@@ -107,16 +113,20 @@ def fit_air(log: CalibrationLog) -> AirFit:
         by_degrees = _shown(valve) and valve.residual < VALVE_BETTER * slow.residual
         found = valve if by_degrees else slow
         found = replace(found, numbers={"vent_lag_exponent": 0.0, **found.numbers})
-    return replace(found, fill_rate=_fill_rate(command, measured), offset=offset)
+    return replace(found, fill_rate=_fill_rate(command, measured, STEP * limit), offset=offset)
 
 
 @dataclass(frozen=True)
 class _Chambers:
-    """Commands and measured pressures (K, M) [Pa], and rows (K, M) to fit to."""
+    """Commands and measured pressures (K, M) [Pa], and rows (K, M) to fit to.
+
+    Errors beyond ``softness`` count less than their square [Pa].
+    """
 
     command: Array
     measured: Array
     rows: NDArray[np.bool_]
+    softness: float
 
     def residual(self, numbers: Mapping[str, float]) -> Array:
         """Return predicted less measured pressures of the rows [Pa]."""
@@ -136,7 +146,7 @@ class _Chambers:
         def rows(values: Array) -> Rows:
             # Of a size of their own: a relative change of a dead time near zero would be none.
             steps = np.where(values + _NUDGE * scale <= high, _NUDGE * scale, -_NUDGE * scale)
-            return with_differences(lambda v: self.residual(of(v)) / SOFTNESS, values, steps)
+            return with_differences(lambda v: self.residual(of(v)) / self.softness, values, steps)
 
         nothing = np.full(len(names), np.inf)
         search = LeastSquares(
@@ -144,7 +154,7 @@ class _Chambers:
         )
         values = search.solve()
         left = float(np.sqrt(np.mean(self.residual(of(values)) ** 2)))
-        covariance = search.covariance(values, (left / SOFTNESS) ** 2 / PERIOD)
+        covariance = search.covariance(values, (left / self.softness) ** 2 / PERIOD)
         return AirFit(of(values), of(np.sqrt(np.diag(covariance))), left)
 
 
@@ -156,10 +166,13 @@ def _shown(found: AirFit) -> bool:
     return known and low < 0.9 * rate < 0.8 * high
 
 
-def _after_no_step(command: Array, rising: bool = False) -> NDArray[np.bool_]:
-    """Tell rows (K, M) with no step just before them; ``rising`` counts only steps up."""
+def _after_no_step(command: Array, rate: float, rising: bool = False) -> NDArray[np.bool_]:
+    """Tell rows (K, M) with no step just before them, one faster than a rate [Pa/s].
+
+    ``rising`` counts only steps up.
+    """
     change = np.diff(command, axis=0, prepend=command[:1])
-    jump = (change if rising else np.abs(change)) > SMOOTH_RATE * PERIOD
+    jump = (change if rising else np.abs(change)) > rate * PERIOD
     count = round(STEP_MEMORY / PERIOD)
     recent = np.cumsum(jump, axis=0)
     before = np.concatenate([np.zeros((count, command.shape[1])), recent])[: len(recent)]
@@ -167,8 +180,8 @@ def _after_no_step(command: Array, rising: bool = False) -> NDArray[np.bool_]:
     return smooth
 
 
-def _fill_rate(command: Array, measured: Array) -> float:
-    jump = np.abs(np.diff(command, axis=0, prepend=command[:1])) > 3000.0
+def _fill_rate(command: Array, measured: Array, step: float) -> float:
+    jump = np.abs(np.diff(command, axis=0, prepend=command[:1])) > step
     if not jump.any():
         return float("nan")
     span = max(2, round(0.3 / PERIOD))

@@ -144,7 +144,7 @@ def _fit(
         recorded = recorded.without(hung.rows)
     warnings = list(recorded.warnings)
     try:
-        air = fit_air(recorded.log)
+        air = fit_air(recorded.log, limb.pneumatics)
     except LogError as error:
         air = None
         warnings.append(f"the chambers' lag keeps its old value: {error}")

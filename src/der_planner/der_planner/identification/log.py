@@ -16,8 +16,8 @@ from der_planner.model import CONTROL_PERIOD, RodModel
 
 LONGEST_GAP = 1.0
 """Gap in the tags that a straight line may bridge [s]; rows in longer ones are not fitted to."""
-LEAST_EXCITATION = 1000.0
-"""Standard deviation of an input below which nothing can be told of its segment [Pa]."""
+LEAST_EXCITATION = 0.042
+"""Standard deviation of an input below which nothing can be told of its segment, over the limit."""
 LEAST_VALID = 0.5
 """Share of a log to fit to in which the tags must be seen."""
 LEAST_SEEN = 0.05
@@ -233,8 +233,9 @@ def prepare(
     _check_scale(pressure, bend, limb)
     if to_fit:
         _check_tips(grid, limb)
-        _check_commands(grid)
-        _check_excitation(pressure[valid & ~swinging])
+        least_excitation = LEAST_EXCITATION * limb.pneumatics.pressure_limit
+        _check_commands(grid, least_excitation)
+        _check_excitation(pressure[valid & ~swinging], least_excitation)
         _check_match(pressure, bend, warnings)
         _check_axes(grid, limb)
     if swinging.any():
@@ -319,11 +320,11 @@ def _check_axes(log: CalibrationLog, limb: Limb) -> None:
         )
 
 
-def _check_commands(log: CalibrationLog) -> None:
+def _check_commands(log: CalibrationLog, least: float) -> None:
     columns = zip(log.commanded_differential.T, log.measured_differential.T, strict=True)
     for index, (command, measured) in enumerate(columns):
         both = np.isfinite(command) & np.isfinite(measured)
-        if both.sum() < 10 or min(np.std(command[both]), np.std(measured[both])) < LEAST_EXCITATION:
+        if both.sum() < 10 or min(np.std(command[both]), np.std(measured[both])) < least:
             continue
         agreement = float(np.corrcoef(command[both], measured[both])[0, 1])
         if agreement < 0.3:
@@ -351,12 +352,12 @@ def _check_scale(pressure: Array, bend: Array, limb: Limb) -> None:
         )
 
 
-def _check_excitation(pressure: Array) -> None:
+def _check_excitation(pressure: Array, least: float) -> None:
     for index, value in enumerate(np.std(pressure, axis=0)):
-        if value < LEAST_EXCITATION:
+        if value < least:
             raise LogError(
                 f"input {index} was not excited (standard deviation {value:.0f} Pa, "
-                f"{LEAST_EXCITATION:.0f} Pa needed): nothing can be told of segment {index}; "
+                f"{least:.0f} Pa needed): nothing can be told of segment {index}; "
                 "run the calibration motion, or name their unit in columns.yaml (pressure_unit)"
             )
 

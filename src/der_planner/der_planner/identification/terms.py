@@ -72,7 +72,8 @@ class FreeTerms:
             and (segment == 0 or not term.shared)
             and 0 <= segment + term.neighbour < limb.segment_count
         )
-        terms = tuple(TERMS[index] for _, index in places)
+        limit = limb.pneumatics.pressure_limit
+        terms = tuple(TERMS[index].at_limit(limit) for _, index in places)
         return cls(limb, values_of(limb) if values is None else values, places, terms)
 
     @property
@@ -123,8 +124,9 @@ def values_of(limb: Limb, *, starts: bool = False) -> Array:
         limb: to describe.
         starts: put plausible friction and creep where it has none, for a search to begin at.
     """
+    terms = [term.at_limit(limb.pneumatics.pressure_limit) for term in TERMS]
     return np.array(
-        [[_value(segment, term, starts) for term in TERMS] for segment in limb.segments]
+        [[_value(segment, term, starts) for term in terms] for segment in limb.segments]
     )
 
 

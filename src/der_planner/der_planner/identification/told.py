@@ -125,14 +125,14 @@ def told(problem: BendFit, values: Array) -> tuple[tuple[Unknown, ...], Array]:
     correlation = covariance / np.outer(deviation, deviation)
     stiff = [term.name == "log_stiffness" for term in free.terms]
     deviation[stiff] = np.maximum(deviation[stiff], STIFFNESS_ERROR)
-    at_bound = free.unknowns.at_bound(values)
+    at_bound, limit = free.unknowns.at_bound(values), free.limb.pneumatics.pressure_limit
     unknowns = tuple(
         Unknown(
             name=_name(term, segment),
             unit=term.unit,
             value=float(value),
             deviation=float(sigma),
-            untold=bool(sigma > UNTOLD * TERMS[place].spread),
+            untold=bool(sigma > UNTOLD * TERMS[place].at_limit(limit).spread),
             at_bound=bool(edge),
         )
         for term, (segment, place), value, sigma, edge in zip(

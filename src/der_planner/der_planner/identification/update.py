@@ -42,8 +42,8 @@ MOST_REST_CHANGE = math.radians(35.0)
 """Largest change of a rest angle in a fit [rad]."""
 FRICTION_SPREAD = 0.5
 """Share of a friction by which it changes from day to day."""
-LEAST_FRICTION_SPREAD = 100.0
-"""Least change of a friction from day to day, as a pressure [Pa]."""
+LEAST_FRICTION_SPREAD = 0.0042
+"""Least change of a friction from day to day, as a share of the pressure limit."""
 MOST_FRICTION_CHANGE = 20.0
 """Largest change of a friction in a fit, in spreads of a day."""
 WRONG_WAY = -0.5
@@ -81,9 +81,9 @@ class DayTerms(FreeTerms):
         # A limb file without friction does not say over which bend it turns round.
         values[:, angle] = values_of(limb, starts=True)[:, angle]
         free = cls.of(limb, names, values)
-        return replace(
-            free, terms=tuple(map(_of_days, free.terms, free.at_places(values).tolist()))
-        )
+        least = LEAST_FRICTION_SPREAD * limb.pneumatics.pressure_limit
+        known = zip(free.terms, free.at_places(values).tolist(), strict=True)
+        return replace(free, terms=tuple(_of_days(term, value, least) for term, value in known))
 
     def limb_with(self, free: Array) -> Limb:
         """Return the limb with values (P,) of the free terms put in place.
@@ -101,14 +101,17 @@ class DayTerms(FreeTerms):
         return replace(found, pcc_segments=to_limb(arcs, changed).segments)
 
 
-def _of_days(term: Term, value: float) -> Term:
-    """Return one of `DAY_TERMS` with what is known of it in a limb whose file gives a value."""
+def _of_days(term: Term, value: float, least_friction: float) -> Term:
+    """Return one of `DAY_TERMS` with what is known of it in a limb whose file gives a value.
+
+    A friction's spread is at least ``least_friction`` [Pa].
+    """
     if term.name == "gain":
         spread, low, high = GAIN_SPREAD * value, value / MOST_GAIN, value * MOST_GAIN
     elif term.name == "rest_angle":
         spread, low, high = REST_SPREAD, value - MOST_REST_CHANGE, value + MOST_REST_CHANGE
     else:
-        spread = max(FRICTION_SPREAD * value, LEAST_FRICTION_SPREAD)
+        spread = max(FRICTION_SPREAD * value, least_friction)
         low, high = 0.0, value + MOST_FRICTION_CHANGE * spread
     return replace(term, spread=spread, scale=spread, low=low, high=high)
 

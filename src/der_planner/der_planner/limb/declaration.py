@@ -38,6 +38,8 @@ class Term:
         start: where the search starts if the limb has 0.
         neighbour: place of the segment that it couples to, relative to its own; 0 for none.
         kept: a fit without its group keeps the prior's value; otherwise the term is off.
+        per_limit: scale, bounds, spread and start are given for a pressure limit of 1 Pa, and grow
+            with this power of a limb's.
     """
 
     name: str
@@ -53,6 +55,13 @@ class Term:
     start: float = 0.0
     neighbour: int = 0
     kept: bool = False
+    per_limit: int = 0
+
+    def at_limit(self, pressure_limit: float) -> Term:
+        """Return the term for limbs of a pressure limit [Pa]."""
+        unit = pressure_limit**self.per_limit
+        keys = ("scale", "low", "high", "spread", "start")
+        return dataclasses.replace(self, **{key: unit * getattr(self, key) for key in keys})
 
 
 @dataclass(frozen=True)

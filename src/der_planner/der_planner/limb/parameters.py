@@ -80,7 +80,8 @@ class Segment:
         "bend angle at a slow pressure / pressure · EI / L; leave it to the calibration",
         interval="(0, inf)",
         fit=Term(
-            *("gain", "rad/Pa", 5e-5, 5e-6, 5e-4, math.inf, "linear"),
+            *("gain", "rad/Pa", 1.2, 0.12, 12.0, math.inf, "linear"),
+            per_limit=-1,
             per={"length": 1, "bending_stiffness": -1},
         ),
     )
@@ -135,7 +136,9 @@ class Segment:
         "relative growth of the stiffness per |differential pressure|",
         "0, or from the calibration, which hardly tells it from cubic_stiffness",
         default=0.0,
-        fit=Term("pressure_stiffening", "1/Pa", 3e-6, -2e-5, 3e-5, 1e-5, "stiffening"),
+        fit=Term(
+            "pressure_stiffening", "1/Pa", 0.072, -0.48, 0.72, 0.24, "stiffening", per_limit=-1
+        ),
     )
     friction_moment: float = parameter(
         "N·m",
@@ -144,9 +147,10 @@ class Segment:
         default=0.0,
         interval="[0, inf)",
         fit=Term(
-            *("friction_pressure", "Pa", 300.0, 0.0, 4000.0, 800.0, "friction"),
+            *("friction_pressure", "Pa", 0.0125, 0.0, 1 / 6, 1 / 30, "friction"),
             per={"moment_gain": -1},
-            start=200.0,
+            start=1 / 120,
+            per_limit=1,
         ),
     )
     friction_curvature: float = parameter(
@@ -169,9 +173,10 @@ class Segment:
         default=0.0,
         interval="[0, inf)",
         fit=Term(
-            *("creep_pressure", "Pa/rad", 500.0, 0.0, 15000.0, 2000.0, "creep"),
+            *("creep_pressure", "Pa/rad", 1 / 48, 0.0, 0.625, 1 / 12, "creep"),
             per={"moment_gain": -1, "length": -1},
-            start=400.0,
+            start=1 / 60,
+            per_limit=1,
         ),
     )
     creep_time: float = parameter(

@@ -41,12 +41,12 @@ _PRESSURE = 1e3
 _LENGTH = 1e-3
 """Length of one unit of the solver [m]."""
 
-_SMOOTHNESS = 2e-7
-"""√λ, tip error that a unit second difference is worth [m/Pa]."""
-_NEARNESS = 1e-8
-"""√μ, tip error that a unit deviation from the warm start is worth [m/Pa]."""
-_NEARNESS_VENTED = 3e-7
-"""√μ of a limb whose chambers are vented slowly [m/Pa].
+_SMOOTHNESS = 4.8e-3
+"""√λ, tip error that a second difference as large as the pressure limit is worth [m]."""
+_NEARNESS = 2.4e-4
+"""√μ, tip error that a deviation from the warm start by the pressure limit is worth [m]."""
+_NEARNESS_VENTED = 7.2e-3
+"""√μ of a limb whose chambers are vented slowly [m].
 
 Close to the straight pose the tip hardly tells the segments apart, and what one of them is asked
 for in vain must not be taken from the other.
@@ -57,6 +57,8 @@ _SETTLED = 75
 """Setpoints of a window that are kept; the rest is solved again."""
 _ITERATIONS = 6
 """Gauss-Newton steps a window at most."""
+_DAMPING = 2.4e-3
+"""Least tip error that a change by the pressure limit is worth once a step was too long [m]."""
 _TOLERANCE = 1e-5
 """Root mean square tip error below which a window is done [m].
 
@@ -108,7 +110,8 @@ class Optimiser:
     ) -> None:
         self.model = model = configuration.model
         usual = _NEARNESS_VENTED if model.air.vents_slowly else _NEARNESS
-        self.nearness = usual if nearness is None else nearness
+        self._limit = model.air.pneumatics.pressure_limit
+        self.nearness = usual / self._limit if nearness is None else nearness
         self.window = window
         wanted = reference.tip if offset is None else reference.tip - offset
         self.target = np.concatenate([wanted[1:], wanted[-1:]])
@@ -179,7 +182,7 @@ class Optimiser:
             except ConvergenceError:
                 new = np.inf, misses, window
             if new[0] > cost:
-                damping, jacobian = max(10 * damping, 1e-7), None
+                damping, jacobian = max(10 * damping, _DAMPING / self._limit), None
                 continue
             gained = rms - rms_distance(new[1])
             command[:last] = trial
@@ -212,7 +215,7 @@ class Optimiser:
         The first two deviations are those of the setpoints before the window.
         """
         each = np.eye(size + 2)
-        smooth = _SMOOTHNESS * np.diff(each, 2, axis=0)
+        smooth = _SMOOTHNESS / self._limit * np.diff(each, 2, axis=0)
         return np.concatenate([smooth, self.nearness * each[2:]])
 
     def _deviation(self, command: Array, first: int) -> Array:

@@ -40,10 +40,11 @@ _HELD = 0.94
 """Share of the pressure that may be held, where a refusal does not tell it."""
 _SHRINK = 0.98
 """Share of what may be held that the next search has."""
-_NOTABLE_CUT = 20.0
-"""Cuts by limits are worth a warning from here on [Pa]."""
-_NOTABLE_OPPOSITE = 1000.0
-"""So much pressure in the opposite chamber, to make up for slow venting, is worth one [Pa]."""
+_NOTABLE_CUT = 8e-4
+"""Cuts by limits are worth a warning from this share of the pressure limit on."""
+_NOTABLE_OPPOSITE = 0.042
+"""So much pressure in the opposite chamber, to make up for slow venting, is worth one; as a share
+of the limit."""
 _NOTABLE_ERROR = 5e-4
 """What the limits leave is worth a warning from here on [m]."""
 _LARGE_ERROR = 5e-3
@@ -180,7 +181,7 @@ def _solve(
     air, before = configuration.model.air, configuration.initial.before
     commands, cut = within_limits(wanted, air, CONTROL_PERIOD, before)
     tip = configuration.response(commands, configuration.bend_at).tip[:-1]
-    return Optimum(commands, tip, 0, int(cut > _NOTABLE_CUT))
+    return Optimum(commands, tip, 0, int(cut > _NOTABLE_CUT * air.pneumatics.pressure_limit))
 
 
 def _led_past(
@@ -269,8 +270,8 @@ def _limit_warnings(
     """Say where slow chambers and limits keep commands from what a balance wants (K, M) [Pa]."""
     missed = float(np.linalg.norm(found.tip - reference.tip, axis=1).mean())
     left = f"mean error of {missed * 1000:.1f} mm on the model itself"
-    said = []
-    if slow is not None and slow.opposite > _NOTABLE_OPPOSITE:
+    said, air = [], configuration.model.air.pneumatics
+    if slow is not None and slow.opposite > _NOTABLE_OPPOSITE * air.pressure_limit:
         effect = f", which leaves a {left}" if missed > _NOTABLE_ERROR else ""
         said.append(
             f"pressure {slow.index} should fall by {slow.wanted:.0f} Pa/s at {slow.time:.1f} s, "
@@ -278,7 +279,6 @@ def _limit_warnings(
             f"filled by up to {slow.opposite:.0f} Pa to make up for it{effect}; a longer period or "
             "a smaller amplitude needs less"
         )
-    air = configuration.model.air.pneumatics
     fastest = np.abs(np.diff(wanted, axis=0)).max(initial=0)
     largest, per_second = np.abs(wanted).max(), fastest / CONTROL_PERIOD
     if found.limited and (largest > air.pressure_limit or per_second > air.slew_limit):
