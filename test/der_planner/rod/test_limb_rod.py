@@ -51,6 +51,13 @@ def test_static_bend_angles_are_those_of_the_segments(connector):
     np.testing.assert_allclose(q, state.q, atol=1e-9)
 
 
+def test_a_short_connector_does_not_keep_a_curved_limb_from_its_rest():
+    limb = changed({"rest_curvature": -3.0}, {"rest_curvature": -1.0}, connector_length=5e-4)
+    rod = Rod.from_limb(limb, 13)
+    found = bend_angles(rod, rod.equilibrium(np.zeros(2)).q)
+    np.testing.assert_allclose(found, [-3.0 * 0.122, -0.122], rtol=1e-6)
+
+
 def test_cubic_stiffness_is_the_segments_law():
     stiffening = 2e-5
     limb = changed({"cubic_stiffness": stiffening}, {"cubic_stiffness": stiffening})
