@@ -19,7 +19,6 @@ from der_planner.identification.lengths import (
     fit_geometry,
     lengths_at_their_end,
     lengths_of,
-    uneven_tip,
     unevenness,
 )
 from der_planner.identification.log import (
@@ -150,13 +149,7 @@ def _fit(
         warnings.append(f"the chambers' lag keeps its old value: {error}")
     offset = 0.0 if air is None else air.offset
     prepared = replace(recorded, pressure=recorded.pressure - offset)
-    try:
-        fitted = _fit_bends_and_lengths(limb, prepared, groups)
-    except GivesWayError:
-        if "cubic" not in groups:
-            raise
-        fitted = _fit_bends_and_lengths(limb, prepared, set(groups) - {"cubic"})
-        warnings.append(_NO_CUBIC)
+    fitted = _fit_bends_and_lengths(limb, prepared, groups, warnings)
     warnings += filter(None, [lengths_at_their_end(limb, fitted.known)])
     if hung is not None:
         change, deviation = hung.stiffness_change(fitted.known, fitted.limb)
@@ -221,24 +214,44 @@ class _Fitted(NamedTuple):
         """The terms that were free."""
         return self.problem.free
 
+    def of_places(self, free: FreeTerms) -> Array:
+        """Return the values (P,) of some of the terms."""
+        found = dict(zip(self.free.places, self.values, strict=True))
+        return np.array([found[place] for place in free.places])
+
     @property
     def residual(self) -> Array:
         """Root mean square (M,) of what is left of the bend angles [rad]."""
         return np.asarray(np.sqrt(np.nanmean(self.remaining**2, axis=0)))
 
 
-def _fit_bends_and_lengths(prior: Limb, prepared: Prepared, groups: Collection[str]) -> _Fitted:
+def _fit_bends_and_lengths(
+    prior: Limb, prepared: Prepared, groups: Collection[str], warnings: list[str]
+) -> _Fitted:
     """Fit the lengths first, or in turn with the bend angles where weight bends the limb unevenly.
 
     The lengths follow from tips and bend angles only if it is known how unevenly each segment
     bends; that follows from a fitted limb, whose weight depends on its lengths. So both are fitted
-    in turn until the lengths stay the same. How unevenly it bends also tells the stiffness.
+    in turn until the lengths stay the same. How unevenly it bends also tells the stiffness. The rod
+    of the planners must follow the log, too.
     """
     loaded = prior.weighs_in_plane
     lengths = fit_geometry(prior, prepared.log) if not loaded else None
     fitted = _fit_bends(lengths.limb if lengths else prior, prepared, groups, lengths)
-    for _ in range(MOST_PASSES if loaded else 0):
-        uneven, lacking = unevenness(fitted.limb, prepared, NODES)
+    passes = MOST_PASSES
+    while loaded:
+        try:
+            uneven, lacking = unevenness(fitted.limb, prepared, NODES)
+        except GivesWayError:
+            if "cubic" not in groups:
+                raise
+            warnings.append(_NO_CUBIC)
+            groups, passes = set(groups) - {"cubic"}, MOST_PASSES
+            fitted = _fit_bends(fitted.known, prepared, groups, lengths, fitted, fitted.tips)
+            continue
+        if passes == 0:
+            break
+        passes -= 1
         lengths = fit_geometry(prior, prepared.log, uneven)
         if lengths is None:
             break
@@ -246,9 +259,7 @@ def _fit_bends_and_lengths(prior: Limb, prepared: Prepared, groups: Collection[s
         change = np.abs(lengths_of(lengths.limb) - lengths_of(fitted.known))
         fitted = _fit_bends(lengths.limb, prepared, groups, lengths, fitted, tips)
         if change[: prior.segment_count + 1].max() < SAME_LENGTH:
-            break
-    if loaded:
-        uneven_tip(fitted.limb, prepared)  # that the rod of the planners follows the log, too
+            passes = 0
     return fitted
 
 
@@ -267,7 +278,7 @@ def _fit_bends(
         prepared: the log.
         groups: of terms to fit.
         lengths: of the limb.
-        before: a fit of the same terms to begin at; None: in closed form from the log's statics.
+        before: a fit of these terms, and others, to begin at; None: in closed form from statics.
         tips: fit to them, too; None: to the bend angles alone.
     """
     names = {term.name for term in TERMS if term.group in ("linear", *groups)}
@@ -283,7 +294,7 @@ def _fit_bends(
     if before is None:
         start = free.at_places(_static_start(free, prepared))
     else:
-        start = before.values
+        start = before.of_places(free)
         problem.weigh(before.problem.errors)
     # In turn with the lengths the weights are found, too, so that one search a pass will do.
     most = 1 if known.weighs_in_plane else MOST_FITS
@@ -342,9 +353,7 @@ def _again(fitted: _Fitted, free: FreeTerms, prepared: Prepared) -> _Fitted:
 
     Returns what was given where the rod cannot follow the log from there.
     """
-    found = dict(zip(fitted.free.places, fitted.values, strict=True))
-    start = np.array([found[place] for place in free.places])
-    tips = fitted.tips
+    start, tips = fitted.of_places(free), fitted.tips
     problem = BendFit(free, RodModel(fitted.known, NODES), [prepared], tips.rows if tips else None)
     problem.weigh(fitted.problem.errors)
     if not problem.search.follows(start):

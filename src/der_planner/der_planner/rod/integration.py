@@ -321,9 +321,7 @@ def find_equilibrium(backend: Backend, start: RodState, u: Array, load: Array) -
     length = float(backend.mesh.rest.sum())
     # An iteration moves nodes by at most twice the shortest edge.
     limit = _STATIC_LIMIT + round(0.5 * length / float(backend.mesh.rest.min()))
-    solver = Solver(
-        h=1.0, extrapolate=np.ones(1), tolerance=1e-11 * length, lever=0.0, limit=limit
-    )
+    solver = Solver(h=1.0, extrapolate=np.ones(1), tolerance=1e-11 * length, lever=0.0, limit=limit)
     state, iterations, update = backend.solve_static(start, u, load, solver)
     if iterations > 0:
         return state
