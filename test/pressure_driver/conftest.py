@@ -1,13 +1,15 @@
 """A driver and an emulated board in simulated time, without ports, threads or ROS."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from pressure_driver.core import DriverCore
-from pressure_driver.emulator.board import EmulatedBoard, Faults
+from pressure_driver.emulator.board import SENSOR_NOISE, EmulatedBoard, Faults
 from pressure_driver.emulator.firmware import BOARDS
-from pressure_driver.emulator.pneumatics import BoardPneumatics
-from pressure_driver.protocols import host_protocol
+from pressure_driver.emulator.pneumatics import SUPPLY_PRESSURE, VENT_EXPONENT, BoardPneumatics
+from pressure_driver.protocols import USUAL_LIMIT, host_protocol
 from pressure_driver.safety import Mode
 from pressure_driver.schedule import Setpoint, Verdict
 from pressure_driver.settings import EmulatorSettings, Settings
@@ -38,12 +40,33 @@ class Simulation:
         self.core = DriverCore(host, self.settings, steady=lambda: self.steady)
         self._other_end = EmulatorSettings(**shared)
         self.board = EmulatedBoard(self.firmware(), BoardPneumatics(2, seed), seed)
+        self._suit(self.settings.pressure_limit / USUAL_LIMIT)
         self.plugged = True
         self.sent = []
         self.received = []
         self.modes = []
         self.armings = 0
         self._receive(self.core.opening())
+
+    def _suit(self, scale):
+        """Give a stronger or weaker limb its air; supply and sensors are no smaller than usual."""
+        air, board = self.board.pneumatics, self.board
+        air._fill_rate *= scale
+        air._vent_deadband *= scale
+        air._vent_coefficient *= scale ** (1.0 - VENT_EXPONENT)
+        self.board_scale = max(scale, 1.0)
+        board._offset *= self.board_scale
+        board.boot()
+        reading, generator = board.reading, np.random.default_rng(0)
+
+        def coarse_reading():
+            told = reading()
+            noise = generator.normal(0.0, SENSOR_NOISE * (self.board_scale - 1.0), 4)
+            return replace(told, chamber_pressure=tuple(told.chamber_pressure + noise))
+
+        if scale > 1.0:
+            board.reading = coarse_reading
+            self.have()
 
     def firmware(self):
         """Return a board's end that has heard nothing yet."""
@@ -120,7 +143,10 @@ class Simulation:
         return self.steady - begin
 
     def have(self, *faults):
-        self.board.set_faults(Faults.parse(faults, 4))
+        found = Faults.parse(faults, 4)
+        if found.supply == SUPPLY_PRESSURE:
+            found.supply = 1e5 + (SUPPLY_PRESSURE - 1e5) * self.board_scale
+        self.board.set_faults(found)
 
     def arm(self):
         """Wait until the driver may be armed, and arm it."""

@@ -96,6 +96,7 @@ class BoardWatch:
         """Say what about the board forbids arming (steady clock [s])."""
         protocol, identity = self._protocol, self.identity
         wanted = self._settings.pressure_limit
+        reach = min(protocol.reach, identity.largest_pressure if identity else wanted)
         problem = ""
         if protocol.introduces_itself and identity is None:
             problem = "the board has not introduced itself yet"
@@ -104,11 +105,8 @@ class BoardWatch:
                 f"the board has {identity.chamber_count} chambers, the driver expects "
                 f"{protocol.chamber_count}: set the parameter 'segment_count'"
             )
-        elif identity and identity.largest_pressure < wanted:
-            problem = (
-                f"the board reaches {identity.largest_pressure:.0f} Pa, less than 'pressure_limit' "
-                f"({wanted:.0f} Pa): lower the parameter"
-            )
+        elif reach < wanted:
+            problem = f"the board reaches {reach:.0f} Pa: lower 'pressure_limit' ({wanted:.0f} Pa)"
         if problem := problem or protocol.unsettled:
             yield Condition(problem, lasting=False)
         waits_since = self._unanswered[0][1] if self._unanswered else now
@@ -242,6 +240,7 @@ class DriverCore:
             "obstacles_to_arming": self.obstacles(),
             "board": self.board.identity.firmware if self.board.identity else self.last_text,
             "atmosphere_pa": monitor.rest.mean,
+            "pressure_limit_pa": machine.schedule.settings.pressure_limit,
             "damaged_frames": self.protocol.rejected,
             "last_damaged_line": self.protocol.last_damaged,
             "ticks_held_back_by_slew_limit": machine.limited_ticks,

@@ -8,11 +8,11 @@ machine, the files under `config/` and the table in the README. After a change, 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import MISSING, Field, dataclass, field, fields
 from typing import Any, NamedTuple, TypeVar
 
-from pressure_driver.protocols import NAMES, SettingError, order_of
+from pressure_driver.protocols import NAMES, USUAL_LIMIT, SettingError, order_of
 
 TERMINALS = ("vtem", "mpa")
 TERMINAL = "valves of a `festo` terminal: a motion terminal, or VPPM regulators"
@@ -28,6 +28,8 @@ class Declaration(NamedTuple):
     unit: str = ""
     range: tuple[float, float] | None = None
     """Smallest and largest admissible number."""
+    derive: Callable[[float], float] | None = None
+    """Returns what 0 stands for at a `pressure_limit`."""
     choices: tuple[str, ...] = ()
     """Admissible texts."""
     changeable: bool = False
@@ -41,6 +43,17 @@ class Declaration(NamedTuple):
 
 def _number(default: Any, unit: str, low: float, high: float, text: str) -> Any:
     return field(default=default, metadata={"declaration": Declaration(text, unit, (low, high))})
+
+
+def _scaled(usual: float, unit: str, top: float, text: str, fixed: float = 0.0) -> Any:
+    # Sensors err by some 200 Pa, and the supply of a weak limb is no weaker.
+    least, share = usual if fixed else 300.0, (usual - fixed) / USUAL_LIMIT
+
+    def derive(limit: float) -> float:
+        return max(fixed + (usual - fixed) * limit / USUAL_LIMIT, least)
+
+    text += f"; 0: {share:.4g} * pressure_limit{f' + {fixed:g}' * bool(fixed)}, at least {least:g}"
+    return field(default=0.0, metadata={"declaration": Declaration(text, unit, (0.0, top), derive)})
 
 
 def _other(default: Any, text: str, choices: tuple[str, ...] = (), changeable: bool = False) -> Any:
@@ -81,10 +94,8 @@ class Settings:
         "valve of the board that feeds each chamber of the limb, as 3,4,1,2; empty: each its own "
         "(scripts/check_rig.py finds it)",
     )
-    pressure_limit: float = _number(24_000.0, "Pa", 0.0, 1e5, "largest differential pressure")
-    slew_limit: float = _number(
-        200_000.0, "Pa/s", 1.0, 1e7, "of setpoints and of what is commanded: 10 kPa a tick"
-    )
+    pressure_limit: float = _number(USUAL_LIMIT, "Pa", 1.0, 1e6, "largest differential pressure")
+    slew_limit: float = _scaled(200_000.0, "Pa/s", 1e8, "of setpoints and of what is commanded")
     atmosphere: float = _number(
         0.0, "Pa", 0.0, 1.1e5, "absolute, of the room; 0: measured with vented chambers"
     )
@@ -101,35 +112,34 @@ class Settings:
         "changes",
         ("hold", "ramp", "vent"),
     )
-    vent_rate: float = _number(10_000.0, "Pa/s", 100.0, 1e6, "of the ramp down")
+    vent_rate: float = _scaled(10_000.0, "Pa/s", 1e7, "of the ramp down")
     vent_timeout: float = _number(10.0, "s", 0.5, 120.0, "a vent may take before it is a fault")
     telemetry_timeout: float = _number(0.5, "s", 0.06, 60.0, "without chamber pressures")
     frozen_time: float = _number(
         2.0, "s", 0.0, 600.0, "in which `ezloop` and `native` readings change; 0: they need not"
     )
-    over_pressure: float = _number(30_000.0, "Pa", 1.0, 2e5, "gauge, in any chamber")
-    supply_low: float = _number(115_000.0, "Pa", 0.0, 1e6, "absolute, smallest supply")
-    supply_high: float = _number(200_000.0, "Pa", 0.0, 1e6, "absolute, largest supply")
+    over_pressure: float = _scaled(30_000.0, "Pa", 2e6, "gauge, in any chamber")
+    supply_low: float = _scaled(115_000.0, "Pa", 2e6, "absolute, smallest supply", fixed=1e5)
+    supply_high: float = _scaled(200_000.0, "Pa", 2e6, "absolute, largest supply", fixed=1e5)
     supply_time: float = _number(0.5, "s", 0.0, 60.0, "the supply may be outside of these")
     supply_required: bool = _other(
         True, "arm only with a fresh reading of the supply, where the protocol tells it"
     )
-    follow_tolerance: float = _number(
-        3_000.0, "Pa", 100.0, 1e5, "beyond the slowest and fastest normal response of a chamber"
+    follow_tolerance: float = _scaled(
+        3_000.0, "Pa", 1e6, "beyond the slowest and fastest normal response of a chamber"
     )
     follow_time: float = _number(2.0, "s", 0.1, 60.0, "a chamber may be outside of it")
-    slowest_fill: float = _number(4_000.0, "Pa/s", 100.0, 1e6, "that a working valve reaches")
+    slowest_fill: float = _scaled(4_000.0, "Pa/s", 1e7, "that a working valve reaches")
     slowest_vent: float = _number(
         2.5, "s", 0.05, 60.0, "time constant in which a working valve vents"
     )
     leak_time: float = _number(
         10.0, "s", 2.0, 600.0, "over which slow leaks are looked for; longer than a fill"
     )
-    leak_tolerance: float = _number(
+    leak_tolerance: float = _scaled(
         1_000.0,
         "Pa",
-        50.0,
-        1e5,
+        1e6,
         "a chamber may lie below its command in the mean of leak_time; choose a few times what a "
         "sound limb shows at steady pressure (20 to 160 Pa on a real one)",
     )
@@ -141,11 +151,13 @@ class Settings:
         "mean opening of an inlet at steady pressure that is no leak; choose twice what "
         "valve_opening shows there; 1: do not look",
     )
-    vented_tolerance: float = _number(500.0, "Pa", 10.0, 5_000.0, "gauge that counts as vented")
+    vented_tolerance: float = _scaled(500.0, "Pa", 1e5, "gauge that counts as vented")
 
     def __post_init__(self) -> None:
         for name, declaration, _ in declarations(type(self)):
-            _check(name, getattr(self, name), declaration)
+            _check(name, value := getattr(self, name), declaration)
+            if declaration.derive and not value:
+                object.__setattr__(self, name, declaration.derive(self.pressure_limit))
         for low, high, reason in (
             ("supply_low", "supply_high", ""),
             ("pressure_limit", "over_pressure", ", or every full command would end in a fault"),
@@ -221,7 +233,7 @@ class TopicBoardSettings:
         0.0, "", -1e9, 1e9, "added to scaled pressures: the room's where they are absolute"
     )
     segment_count: int = _number(2, "", 1, 16, "pairs of chambers")
-    largest_pressure: float = _number(30_000.0, "Pa", 0.0, 1e6, "gauge, that the valves take")
+    largest_pressure: float = _number(1e6, "Pa", 0.0, 1e6, "gauge, that the valves take")
 
     def __post_init__(self) -> None:
         for name in ("command_topic", "measured_topic"):

@@ -9,17 +9,13 @@ from statistics import fmean
 from typing import TYPE_CHECKING, NamedTuple
 
 from pressure_driver.following import Duration, Following, chamber_gauge
-from pressure_driver.protocols import STANDARD_ATMOSPHERE, HostProtocol, Telemetry
+from pressure_driver.protocols import STANDARD_ATMOSPHERE, USUAL_LIMIT, HostProtocol, Telemetry
 
 if TYPE_CHECKING:
     from pressure_driver.settings import Settings
 
-PLAUSIBLE_READING = (30_000.0, 400_000.0)
-"""[Pa] A chamber that reads outside has a broken sensor or a damaged line."""
 BELOW_REST_TIME = 0.5
 """[s] that a chamber may read too little."""
-BELOW_REST = 1_000.0
-"""[Pa] A chamber this far below its rest pressure shows that the rest was taken under pressure."""
 SAMPLES_TO_TRIP = 2
 """Readings in a row: one damaged line of a protocol without checksum must not vent a limb."""
 READING_WINDOW = 2.0
@@ -33,8 +29,9 @@ PLAUSIBLE_ATMOSPHERE = (70_000.0, 105_000.0)
 """[Pa] at 3000 m, and above what the barometer reads at sea level but for a few days in a century:
 chambers that rest higher hold trapped air, unless the parameter 'atmosphere' says otherwise."""
 LARGEST_OFFSET = 1_000.0
-"""[Pa] that the sensors of one board may differ by at rest, and that a chamber may rest higher than
-it did before."""
+"""[Pa] that the sensors of one board may differ by at rest, that a chamber may rest higher than it
+did before, and that it may be below its rest pressure: more shows that the rest was taken under
+pressure. This and the next two are in proportion for stronger limbs, whose sensors are coarser."""
 REST_TIME = 1.0
 """[s] of steady readings that make a rest measurement."""
 REST_SPREAD = 100.0
@@ -64,19 +61,20 @@ class RestPressures:
 
     Args:
         chamber_count: 2M.
-        atmosphere: [Pa] absolute if it is known; 0 to measure it.
+        settings: with the atmosphere, if it is known.
         resolution: [Pa] of one step of the readings, which may flicker by as much.
     """
 
-    def __init__(self, chamber_count: int, atmosphere: float, resolution: float) -> None:
-        self.pressure = [atmosphere or math.nan] * chamber_count
+    def __init__(self, chamber_count: int, settings: Settings, resolution: float) -> None:
+        coarseness = max(1.0, settings.pressure_limit / USUAL_LIMIT)
+        self.pressure = [settings.atmosphere or math.nan] * chamber_count
         """(2M,) [Pa] absolute, what each sensor reads when vented; NaN until measured."""
         self.mean = fmean(self.pressure)
         """[Pa] of them; NaN until they are all known."""
-        self._given = bool(atmosphere)
-        self._largest_spread = REST_SPREAD + resolution
-        self._largest_drift = REST_DRIFT + resolution / 2.0
-        self._largest_offset = LARGEST_OFFSET + resolution
+        self._given = bool(settings.atmosphere)
+        self._largest_spread = REST_SPREAD * coarseness + resolution
+        self._largest_drift = REST_DRIFT * coarseness + resolution / 2.0
+        self.largest_offset = LARGEST_OFFSET * coarseness + resolution
         self._window: deque[tuple[float, Sequence[float]]] = deque()
         self.problem = NOT_STEADY
         """Why the newest reading ended no measurement; empty if it did."""
@@ -125,16 +123,16 @@ class RestPressures:
                 f"{high:.0f} Pa): let trapped air out, or set the parameter 'atmosphere' to what a "
                 "barometer reads"
             )
-        if most - least > self._largest_offset:
+        if most - least > self.largest_offset:
             return (
                 f"chambers read {least:.0f} to {most:.0f} Pa: vented they agree within "
-                f"{self._largest_offset:.0f} Pa"
+                f"{self.largest_offset:.0f} Pa"
             )
         chambers = zip(*(each for _, each in self._window), strict=True)
         if any(max(values) - min(values) > self._largest_spread for values in chambers):
             return NOT_STEADY
         higher = max(now - before for now, before in zip(newest, self._lowest, strict=True))
-        if higher > self._largest_offset:
+        if higher > self.largest_offset:
             return (
                 f"chambers rest {higher:.0f} Pa higher than before: let trapped air out, or start "
                 "the driver again"
@@ -152,11 +150,13 @@ class TelemetryMonitor:
 
     def __init__(self, protocol: HostProtocol, settings: Settings) -> None:
         count = protocol.chamber_count
-        self.rest = RestPressures(count, settings.atmosphere, protocol.resolution)
+        self.rest = RestPressures(count, settings, protocol.resolution)
         self.valve_opening = [math.nan] * count
         self.vented_tolerance = max(settings.vented_tolerance, 1.5 * protocol.resolution)
         """[Pa] gauge that counts as vented."""
         self.supply_pressure = math.nan
+        self._plausible = (30_000.0, 370_000.0 + settings.over_pressure)
+        """[Pa] A chamber that reads outside has a broken sensor or a damaged line."""
         self._settings = settings
         self._protocol = protocol
         self._following = [Following(chamber, settings) for chamber in range(count)]
@@ -224,7 +224,7 @@ class TelemetryMonitor:
         reading = telemetry.chamber_pressure
         if reading is None:
             return
-        low, high = PLAUSIBLE_READING
+        low, high = self._plausible
         bad = [chamber for chamber, value in enumerate(reading) if not low < value < high]
         if bad:
             self._lines.append((now, 0, 0, 1))
@@ -247,7 +247,7 @@ class TelemetryMonitor:
         else:
             self.rest.forget_readings()
         gauge = self.gauge
-        self._below_rest.note(min(gauge) < -(BELOW_REST + self._protocol.resolution), now)
+        self._below_rest.note(min(gauge) < -self.rest.largest_offset, now)
         for chamber, value, opening in zip(self._following, gauge, self.valve_opening, strict=True):
             chamber.receive(value, opening, now)
 
@@ -346,7 +346,7 @@ class TelemetryMonitor:
         sound, damaged, bad = self._recent_lines(now)
         total = damaged + sound
         if bad >= MOST_BAD_READINGS:
-            low, high = PLAUSIBLE_READING
+            low, high = self._plausible
             yield Condition(
                 f"chamber {self._bad_chamber} has no plausible reading: {bad} of the last "
                 f"{READING_WINDOW:g} s were no number or outside {low:.0f} to {high:.0f} Pa"

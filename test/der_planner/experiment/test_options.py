@@ -84,6 +84,12 @@ def test_a_rig_file_of_a_twin_needs_no_board_and_no_limb_file(tmp_path: Path):
     assert found["pressure_driver"]["wiring"] == "2,1,4,3"
 
 
+def test_the_limits_of_a_rig_are_those_of_its_driver():
+    limits = Hardware(driver={"pressure_limit": 240e3, "port": "/dev/null", "misspelt": 1}).limits
+    assert (limits.pressure_limit, limits.slew_limit) == (240e3, 2e6)
+    assert Hardware(driver={"slew_limit": 5e4}).limits.slew_limit == 5e4
+
+
 def test_the_twin_has_the_board_that_is_named(tmp_path: Path):
     board, driver, *_ = GraphSetup(tmp_path, {}, board="festo").nodes("tcp://127.0.0.1:5020")
     assert board.parameters["protocol"] == driver.parameters["protocol"] == "festo"

@@ -24,7 +24,7 @@ BEFORE = 12
 
 def record(seed: int) -> RigLog:
     """Play a check on the twin, in simulated time."""
-    run, limb = check_run(), OfflineTwin(seed)
+    run, limb = check_run(2, 3_000.0), OfflineTwin(seed)
     random = np.random.default_rng(seed)
     measured, places = [], []
     for command in run.differential_pressure:
@@ -112,6 +112,17 @@ def test_lags_and_rises_are_those_of_the_twin(straight):
         # The dead time of a valve, and 0.1 of 3 kPa at 9 kPa/s.
         assert 0.03 < each.to_pressure < 0.15
         assert -0.05 < each.to_motion < 0.4
+
+
+@pytest.mark.slow
+def test_a_sensor_that_errs_is_no_leak_of_a_weak_limb(straight):
+    """An eighth of 4 kPa is 500 Pa: sensors err by up to half of it, a leak leaves more missing."""
+    rest = straight.measured[:20].mean(axis=0)
+    for missing, leaks in ((240.0, False), (350.0, True)):
+        measured = rest + (1.0 - missing / 500.0) / 6.0 * (straight.measured - rest)
+        weak = dataclasses.replace(straight, command=straight.command / 6.0, measured=measured)
+        found = find_rig(weak)
+        assert any("it leaks" in each for each in found.warnings) == leaks
 
 
 @pytest.mark.slow

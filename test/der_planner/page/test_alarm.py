@@ -49,6 +49,23 @@ def test_a_page_without_a_driver_says_how_to_start_one(situation: Situation) -> 
 
 
 @pytest.mark.parametrize(
+    ("limit", "measured", "limb"),
+    [
+        ("4000", 900.0, "under pressure (0.9 kPa)"),
+        ("24000", 900.0, "without pressure"),
+        ("250000", 9_000.0, "without pressure"),
+        ("250000", 11_000.0, "under pressure (11.0 kPa)"),
+    ],
+)
+def test_a_limb_is_under_pressure_from_a_share_of_the_drivers_limit_on(
+    situation: Situation, limit: str, measured: float, limb: str
+) -> None:
+    situation.put_status(status("/limb/pressure_driver", pressure_limit_pa=limit))
+    situation.put_driver(state(PressureState.DISARMED, measured))
+    assert situation.snapshot()["limb_is"] == limb
+
+
+@pytest.mark.parametrize(
     ("measured", "limb"),
     [(13_400.0, "under pressure (13.4 kPa)"), (40.0, "without pressure"), (math.nan, "unknown")],
 )

@@ -72,6 +72,23 @@ def test_each_chamber_counts_only_if_it_is_driven_alone() -> None:
     assert rig.steps()[2].done
 
 
+@pytest.mark.parametrize("limit", [4e3, 250e3])
+def test_chambers_of_other_limbs_count_at_the_same_share_of_the_drivers_limit(limit: float) -> None:
+    rig = GuidedSetup()
+    told = KeyValue(key="pressure_limit_pa", value=f"{limit:g}")
+    rig.situation.put_status(DiagnosticStatus(name="/limb/pressure_driver", values=[told]))
+    rig.drive((0.04 * limit, 0.0))
+    assert rig.steps()[1].done
+    for measured in ((0.12, 0.0), (0.2, 0.05), (-0.13, 0.0), (0.0, 0.2)):
+        rig.drive(tuple(share * limit for share in measured), mode=2)
+        rig.steps()
+    seen = rig.steps()[2].seen
+    assert "segment 0 left" in seen
+    assert "segment 1 right" in seen
+    assert "segment 0 right" not in seen
+    assert "segment 1 left" not in seen
+
+
 def test_pressure_that_stays_and_a_limb_that_nobody_identified_are_no_success() -> None:
     rig = GuidedSetup()
     rig.drive((1500.0, 0.0))

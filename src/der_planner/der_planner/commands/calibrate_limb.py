@@ -74,7 +74,6 @@ from der_planner.identification.terms import GROUPS
 from der_planner.limb import Limb, LimbError, Load
 from der_planner.model import CONTROL_PERIOD
 from der_planner.planning.loads import nearly_buckling
-from pressure_driver.settings import Settings
 
 LAST_PART = 0.25
 """Share of a LOG that is kept back to judge the fit."""
@@ -344,11 +343,11 @@ def _play_on_graph(prior: Limb, given: argparse.Namespace) -> Path:
 
     interrupt_once()
     hardware = Hardware.from_yaml(given.hardware) if given.hardware else None
-    driver = {**dataclasses.asdict(Settings()), **(hardware.driver if hardware else {})}
-    limit = min(prior.pneumatics.pressure_limit, float(driver["pressure_limit"]))
+    driver = (hardware or Hardware()).limits
+    limit = min(prior.pneumatics.pressure_limit, driver.pressure_limit)
     # Steps may be faster than the limb's own slew_limit, which is for plans: they show how the air
     # follows. The driver's limit holds for every setpoint.
-    run = within_limits(_excitation(prior, limit, given), limit, float(driver["slew_limit"]))
+    run = within_limits(_excitation(prior, limit, given), limit, driver.slew_limit)
     return play_calibration(run, given.folder, Progress(), prior, given.seed, hardware)
 
 

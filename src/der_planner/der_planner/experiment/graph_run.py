@@ -46,8 +46,8 @@ STARTED = 2.0
 """The recorder has told this long [s] after the first setpoint that it records."""
 PORT_VENTS = 3.0
 """The process of a dead driver's port has vented the limb after this time [s]."""
-VENTED_PRESSURE = 1000.0
-"""A limb counts as vented below this differential pressure [Pa]."""
+VENTED = 1.0 / 24.0
+"""A limb counts as vented below this share of the driver's limit."""
 EXPERIMENT = "experiment"
 """Name of the node that says what the experiment does."""
 
@@ -272,7 +272,8 @@ class RunningGraph:
         def vented() -> bool:
             state = self.client.newest.get(topics.PRESSURE_STATE)
             measured = state.measured_differential if state is not None else []
-            return bool(measured) and all(abs(value) < VENTED_PRESSURE for value in measured)
+            told = self.client.diagnostic_values("pressure_driver").get("pressure_limit_pa", 24e3)
+            return bool(measured) and all(abs(value) < VENTED * float(told) for value in measured)
 
         self.client.wait_for(vented, 30.0, "the chambers to vent")
 

@@ -23,6 +23,7 @@ from der_planner.files import read_yaml
 from der_planner.limb import Limb
 from der_planner.planning import Obstacles
 from pressure_driver.protocols import order_of
+from pressure_driver.settings import Settings
 
 STOP_ORDER = (
     "planner",
@@ -85,6 +86,12 @@ class Hardware:
     remap: dict[str, str] = field(default_factory=dict)
     hosts: dict[str, str] = field(default_factory=dict)
     limb: str | None = None
+
+    @property
+    def limits(self) -> Settings:
+        """The driver's segments and limits; whatever else stands there, its node judges."""
+        names = {"segment_count", "pressure_limit", "slew_limit"} & self.driver.keys()
+        return Settings(**{name: self.driver[name] for name in names})
 
     @property
     def place(self) -> str:

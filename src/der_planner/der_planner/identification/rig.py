@@ -19,8 +19,8 @@ from der_planner.identification.excitation import Excitation
 from der_planner.model import CONTROL_PERIOD
 from der_planner.model.air import pair_of
 
-GENTLE = 3000.0
-"""Pressure of the fills [Pa]: a tenth of a right angle on the default limb."""
+GENTLE = 0.125
+"""Pressure of the fills over the driver's limit: a tenth of a right angle on the default limb."""
 REST, HOLD, VENT = 2.0, 3.0, 4.0
 """Before the first fill, of each fill, and after each [s]."""
 LEVEL = 0.5
@@ -33,8 +33,9 @@ LEAST_BEND = np.deg2rad(1.0)
 """Bend that counts as one [rad]."""
 CLEAR = 0.5
 """The second largest answer must be below this share of the largest one."""
-LEAKS, OPEN = 0.1, 0.1
-"""Shortfall of the pressure, and opening of the inlet at steady pressure, that mean a leak."""
+LEAKS, SENSOR_ERROR, OPEN = 0.1, 300.0, 0.1
+"""A leak: this shortfall of the pressure, which must be more than a sensor's error [Pa], or this
+opening of the inlet at steady pressure."""
 STAYS = 0.15
 """Share of the rise that is left after `VENT` in a chamber that does not vent."""
 SIDES = {1: "left", -1: "right"}
@@ -162,7 +163,7 @@ class RigFinding:
         ]
 
 
-def check_run(segment_count: int = 2, pressure: float = GENTLE) -> Excitation:
+def check_run(segment_count: int, pressure: float) -> Excitation:
     """Return the pressures of a check: each chamber is filled once, alone, and vented."""
     held, vented = round(HOLD / CONTROL_PERIOD), round(VENT / CONTROL_PERIOD)
     rows = [np.zeros((round(REST / CONTROL_PERIOD), segment_count))]
@@ -296,7 +297,7 @@ def _judge(log: RigLog, valve: int, fill: tuple[float, float], bends: Array) -> 
         answered = _crossing(log.time, pressure, fill)
         short = 1.0 - rise / wanted
         opening = _level(log.time, log.opening, end)[valve]
-        if short > LEAKS or opening > OPEN:
+        if wanted - rise > max(LEAKS * wanted, SENSOR_ERROR) or opening > OPEN:
             below = f"{100 * short:.0f} % below its command, its inlet {100 * opening:.0f} % open"
             problems.append(f"it leaks or is fed too little: {below}")
         left = _change(log.time, pressure, (start, end + VENT))

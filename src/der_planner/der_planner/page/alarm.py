@@ -9,8 +9,8 @@ from limb_interfaces.diagnostics import TOUCHED
 
 SUPPLY = "close the valve at the air supply"
 """What is left where no program can vent the limb."""
-PRESSED = 1.0
-"""A limb counts as under pressure from this differential pressure [kPa] on."""
+PRESSED = 1.0 / 24.0
+"""A limb counts as under pressure from this share of the driver's limit on."""
 BOARD_SILENT = 0.5
 """A valve board counts as silent after this time [s] without telemetry."""
 LATE = 1.6
@@ -81,7 +81,7 @@ def describe_limb(driver: dict[str, Any] | None) -> str:
     measured, commanded = driver["measured_kpa"], driver["commanded_kpa"]
     known = [abs(value) for value in (*measured, *commanded) if value is not None]
     largest = max(known, default=0.0)
-    if largest > PRESSED:
+    if largest > PRESSED * driver["limit_kpa"]:
         return f"under pressure ({largest:.1f} kPa)"
     return "of unknown pressure" if not measured or None in measured else "without pressure"
 

@@ -10,22 +10,19 @@ from typing import Any
 
 from nicegui import Client, ui
 
-from der_planner.page.alarm import board_answers
+from der_planner.page.alarm import PRESSED, board_answers, describe_limb
 from der_planner.page.commands import FILLING, Answer
 from der_planner.page.server import STATIC, Parts
-from der_planner.page.situation import PASCAL_PER_KILOPASCAL
 
 ADDRESS = "/setup"
 RECONNECT = 60.0
 """What a window's panels hold is kept for this time [s] while its connection is away."""
 INTERVAL = 0.5
 """The steps are judged at this interval [s]."""
-DRIVEN = 3.0
-"""A segment counts as driven to one side from this differential pressure [kPa] on."""
-FILLED = 5.0
-"""The page's buttons fill a chamber to this pressure [kPa], or less where the limb bears less."""
-VENTED = 1.0
-"""A segment counts as vented below this differential pressure [kPa]."""
+DRIVEN = 1.0 / 8.0
+"""A segment counts as driven to one side from this share of the driver's limit on."""
+FILLED = 5.0 / 24.0
+"""The page's buttons fill a chamber to this share of it, or less where the limb bears less."""
 MOCAP = "motion capture stands in its place: pose_tracker runs"
 CHAMBERS = "Each chamber has been filled alone"
 """Title of the step with the buttons that fill chambers."""
@@ -110,13 +107,14 @@ class SetupGuide:
 
     def _watch(self, driver: dict[str, Any] | None) -> None:
         """Remember what the driver does now."""
-        plan = "" if driver is None else driver["plan_id"]
+        driver = driver or {"plan_id": "", "measured_kpa": []}
+        plan, known = driver["plan_id"], driver["measured_kpa"]
         self._playing = next((each for each in (CHECK, CALIBRATION) if plan.startswith(each)), "")
         self._played.add(self._playing)
-        pressures = [] if driver is None else [value or 0.0 for value in driver["measured_kpa"]]
-        for index, value in enumerate(pressures):
-            others = [abs(p) for k, p in enumerate(pressures) if k != index]
-            if abs(value) >= DRIVEN and max(others, default=0.0) < VENTED:
+        shares = [(value or 0.0) / driver["limit_kpa"] for value in known]
+        for index, value in enumerate(shares):
+            others = [abs(share) for k, share in enumerate(shares) if k != index]
+            if abs(value) >= DRIVEN and max(others, default=0.0) < PRESSED:
                 self._driven.add((index, 1 if value > 0 else -1))
 
     def _each_chamber(self) -> Step:
@@ -180,7 +178,7 @@ def _zero_pressure(driver: dict[str, Any] | None) -> Step:
     measured: Sequence[float | None] = [] if driver is None else driver["measured_kpa"]
     known = [abs(value) for value in measured if value is not None]
     vented = driver is not None and driver["mode"] == "disarmed"
-    zero = bool(known) and len(known) == len(measured) and max(known) < VENTED
+    zero = describe_limb(driver) == "without pressure"
     seen = f"largest differential pressure {max(known):.2f} kPa" if known else "nothing measured"
     if driver is not None and not vented:
         seen += f", the driver is {driver['mode']}"
@@ -276,7 +274,6 @@ def add_setup_guide(parts: Parts) -> None:
 def _add_buttons(client: Client, parts: Parts) -> None:
     """Add the buttons that arm and fill one chamber; each commands only as long as it acts."""
     limit = parts.previewer.limb.pneumatics.pressure_limit
-    pressure = min(FILLED * PASCAL_PER_KILOPASCAL, limit)
 
     def may_command() -> bool:
         if parts.desk.take(client.id):
@@ -294,12 +291,13 @@ def _add_buttons(client: Client, parts: Parts) -> None:
     async def fill(segment: int, side: int) -> None:
         if may_command():
             try:
+                pressure = min(FILLED * parts.situation.limit, limit)
                 show_answer(client, parts.commands.fill(segment, side, pressure))
                 await asyncio.sleep(FILLING)
             finally:
                 parts.desk.leave(client.id)
 
-    ui.label(f"One chamber alone, {pressure / PASCAL_PER_KILOPASCAL:.0f} kPa for {FILLING:.0f} s:")
+    ui.label(f"One chamber alone, for {FILLING:.0f} s:")
     with ui.row().classes("line"):
         ui.button("Arm", on_click=arm, color="positive").props('id="arm"')
         for segment in range(parts.previewer.limb.segment_count):

@@ -103,6 +103,7 @@ class Situation:
             "plan_id": message.plan_id,
             "commanded_kpa": _kilopascal(message.commanded_differential),
             "measured_kpa": _kilopascal(measured),
+            "limit_kpa": self.limit / PASCAL_PER_KILOPASCAL,
             "supply_kpa": _number(message.supply_pressure / PASCAL_PER_KILOPASCAL, 1),
             "telemetry_age": _number(message.telemetry_age, 2),
         }
@@ -223,6 +224,11 @@ class Situation:
             return None
         share = (stamp - early) / (late - early)
         return x0 + share * (x1 - x0), y0 + share * (y1 - y0)
+
+    @property
+    def limit(self) -> float:
+        """The driver's largest differential pressure [Pa]; its default before it has said so."""
+        return float(self.value_of("pressure_driver", "pressure_limit_pa") or 24e3)
 
     def snapshot(self) -> dict[str, Any]:
         """Return everything as JSON can carry it: kPa, cm and degrees, None where unknown."""

@@ -137,7 +137,7 @@ class NativeBoard(BoardProtocol):
     def __init__(
         self,
         chamber_count: int = 4,
-        largest_pressure: int = 30_000,
+        largest_pressure: int = 1_000_000,
         known: int = StatusFlag.SUPPLY_KNOWN | StatusFlag.VALVES_KNOWN,
     ) -> None:
         super().__init__(chamber_count, FrameSplitter())

@@ -21,6 +21,8 @@ NAMES = ("ezloop", "ctrlp", "native", "festo", "pneudrive")
 """The protocols that can be chosen, which are the names of their modules."""
 STANDARD_ATMOSPHERE = 101_325.0
 """[Pa]"""
+USUAL_LIMIT = 24_000.0
+"""[Pa] The default of `pressure_limit`, to which other pressures are in proportion."""
 LONGEST_LINE = 512
 """[bytes] A longer line is garbage: its bytes are dropped up to the next line end."""
 LONGEST_SHOWN = 80
@@ -207,6 +209,8 @@ class HostProtocol(ABC):
     """Whether pressures are told finely enough that those of a working sensor always tremble."""
     assumed_atmosphere: float = STANDARD_ATMOSPHERE
     """[Pa] added to the reports of boards that only know gauge pressures."""
+    reach: float = 1e6
+    """[Pa] gauge, the largest that its numbers can command."""
     resolution: float = 0.0
     """[Pa] of one step of its readings, where that is coarser than their noise."""
     clock: Callable[[], float]

@@ -51,6 +51,7 @@ class EzloopHost(LineHost):
     )
     reports_supply = True
     tells_pascals = True
+    reach = LARGEST_WIRE_VALUE * PASCAL_PER_HECTOPASCAL
 
     def __init__(self, chamber_count: int = 4) -> None:
         super().__init__(chamber_count)

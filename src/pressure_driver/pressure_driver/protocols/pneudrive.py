@@ -94,7 +94,7 @@ class PneudriveHost(HostProtocol):
     def configure(self, settings: Settings) -> None:
         """Take over the board's number and the range of its sensors."""
         self._frames.configure(settings)
-        self.resolution = self._frames.resolution
+        self.resolution, self.reach = self._frames.resolution, settings.sensor_range
 
     def start(self) -> bytes:
         """Nothing: the board speaks when it is spoken to."""
