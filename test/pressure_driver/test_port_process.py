@@ -220,7 +220,8 @@ def test_by_hand_it_takes_lines_from_a_terminal(rig):
         return process.stdout.readline() == "armed\n"
 
     wait_for(armed, "an answer")
-    process.stdin.write("3000 -2000\n")
+    for line in ("500 0\n", "3000 -2000\n"):
+        process.stdin.write(line)
     wait_for(rig.pressurised, "pressure")
     process.stdin.close()
     assert process.wait(30.0) == 0

@@ -51,6 +51,7 @@ class Terminal(Channel):
         self._port = port
         self._lines: deque[str] = deque()
         self._shown_at = 0.0
+        self._count = 0
 
     def fileno(self) -> int:
         """Return the descriptor to wait for."""
@@ -83,8 +84,10 @@ class Terminal(Channel):
             text = os.read(self.fileno(), 4096).decode()
             self._lines += text.splitlines() if text else ["end"]
         words = self._lines.popleft().split() or ["alive"]
+        self._count += 1
         with contextlib.suppress(ValueError):
-            return ["setpoint", 0, [float(word) for word in words], "", 0, 0, "", 0, True], None
+            pressures = [float(word) for word in words]
+            return ["setpoint", 0, pressures, "", 0, 0, "", self._count, True], None
         return words[:1], None
 
 

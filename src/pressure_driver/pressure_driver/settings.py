@@ -265,8 +265,8 @@ def _check(name: str, value: Any, declaration: Declaration) -> None:
         raise SettingError(f"parameter '{name}' is '{value}': choose {choices}")
     if declaration.range is not None:
         low, high = declaration.range
-        if not low <= value <= high:
+        if not (isinstance(value, int | float) and low <= value <= high):
             raise SettingError(
-                f"parameter '{name}' ({declaration.description}) is {value:g}: "
+                f"parameter '{name}' ({declaration.description}) is {value}: "
                 f"allowed are {low:g} to {high:g}"
             )

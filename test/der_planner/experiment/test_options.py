@@ -51,6 +51,10 @@ def test_hardware_without_its_serial_device_is_refused(tmp_path: Path):
     rig.write_text("pump: {}\n")
     with pytest.raises(OptionError, match="unknown key 'pump'"):
         parse(["--hardware", str(rig)])
+    for limit in ("2.0e+9", "24 kPa"):
+        rig.write_text(f"driver: {{pressure_limit: {limit}}}\ntwin: {{}}\n")
+        with pytest.raises(OptionError, match=r"rig\.yaml: driver: .*pressure_limit.* allowed are"):
+            parse(["--hardware", str(rig)])
 
 
 def test_a_node_of_another_computer_is_marked_and_keeps_its_parameters_there(tmp_path: Path):

@@ -22,7 +22,7 @@ from der_planner.experiment.console import OptionError
 from der_planner.files import read_yaml
 from der_planner.limb import Limb
 from der_planner.planning import Obstacles
-from pressure_driver.protocols import order_of
+from pressure_driver.protocols import SettingError, order_of
 from pressure_driver.settings import Settings
 
 STOP_ORDER = (
@@ -118,6 +118,10 @@ class Hardware:
                 raise OptionError(f"hardware file {path}: {key} must be {what}, got {value!r}")
         hardware = cls(**{key: value for key, value in content.items() if value is not None})
         hardware.hosts.update(_hosts(hardware, path))
+        try:
+            _ = hardware.limits
+        except SettingError as error:
+            raise OptionError(f"hardware file {path}: driver: {error}") from error
         named = {**hardware.tracker, **(hardware.poses or {}), **hardware.planner}
         for key, file in named.items():
             if key.endswith(("_map", "_file")) and file and not Path(file).exists():
