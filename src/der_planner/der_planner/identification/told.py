@@ -19,7 +19,7 @@ Mask = NDArray[np.bool_]
 UNTOLD = 0.8
 """If the fit leaves an unknown more than this share of its prior deviation, the log does not tell
 it."""
-STIFFNESS_ERROR = 0.05
+STIFFNESS_ERROR = 0.08
 """Least deviation of the logarithm of a stiffness: no model's friction is that of the limb."""
 ANOTHER_STIFFNESS = 3.0, math.log(1.5)
 """Differences of the logarithm of a stiffness by a known weight from that by motion beyond which

@@ -22,7 +22,7 @@ from der_planner.rod.step_kernel import Place, Record, SolveChain, Solver
 Method = Literal["sdirk2", "midpoint", "backward_euler"]
 
 _LIMIT = 30  # most Newton iterations of a solve in time
-_STATIC_LIMIT = 40  # most Newton iterations of a solve at rest, beside those of the way there
+_STATIC_LIMIT = 40  # most Newton iterations of a solve at rest, with edges of one length
 _SMALLEST_PART = 1.0 / 4096.0  # of a load that is raised in parts
 _GAMMA = 1.0 - math.sqrt(0.5)
 # fraction of the step that a solve goes over, and e of each solve: see step_kernel
@@ -318,9 +318,10 @@ def find_equilibrium(backend: Backend, start: RodState, u: Array, load: Array) -
     Raises:
         ConvergenceError: the parts became too small.
     """
-    length = float(backend.mesh.rest.sum())
+    edges = backend.mesh.rest
+    length = float(edges.sum())
     # An iteration moves nodes by at most twice the shortest edge.
-    limit = _STATIC_LIMIT + round(0.5 * length / float(backend.mesh.rest.min()))
+    limit = _STATIC_LIMIT + round(0.5 * length * float(1.0 / edges.min() - 1.0 / edges.mean()))
     solver = Solver(h=1.0, extrapolate=np.ones(1), tolerance=1e-11 * length, lever=0.0, limit=limit)
     state, iterations, update = backend.solve_static(start, u, load, solver)
     if iterations > 0:
