@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from apriltag_tracker.camera.images import check_grey
 from apriltag_tracker.detection.codes import code_table, nearest_tag, read_codes
 from apriltag_tracker.detection.edges import refine_quads
-from apriltag_tracker.family import Family, FamilyError, named
+from apriltag_tracker.family import Family, named
 
 SMALLEST_TAG = 14.0
 """A shorter side is not looked for [px]; a cell of such a tag is 1.75 px wide."""
@@ -43,9 +43,6 @@ by this share of a cell for a misfit of one that is beyond `_SHARP_MISFIT`."""
 
 _LARGEST_RESIDUAL = 0.4
 """A candidate is dropped whose border's lines have a larger RMS residual than this [px]."""
-
-_CHECKED: set[str] = set()
-"""Families whose conventions have been checked in this process."""
 
 
 @dataclass(frozen=True)
@@ -116,7 +113,6 @@ class Detector:
 
     Raises:
         ValueError: a tag smaller than can be read, or more forgiven cells than are safe.
-        FamilyError: this OpenCV answers otherwise than this package expects.
     """
 
     def __init__(
@@ -137,9 +133,6 @@ class Detector:
             )
         self.smallest = smallest
         self.correct_bits = correct_bits
-        if self.family.name not in _CHECKED:
-            self._check_conventions()
-            _CHECKED.add(self.family.name)
 
     def detect(self, gray: NDArray[np.uint8], thorough: bool = False) -> list[Tag]:
         """Find the tags of an image (rows, columns) of uint8; an id may be there more than once.
@@ -220,28 +213,6 @@ class Detector:
         shifts = _BLENDED * np.maximum(misfits - _SHARP_MISFIT, 0.0) * cells
         covariances[good] += shifts[good, None, None] ** 2 * np.eye(8)
         return _Candidates(corners, covariances, residuals, codes, good)
-
-    def _check_conventions(self) -> None:
-        """Detect one known tag; check id, corner order, rotation and pixel convention.
-
-        Raises:
-            FamilyError: this OpenCV answers otherwise than this package expects.
-        """
-        self.family.check_code_of_tag_0()
-        cells = self.family.border_cells
-        scale = max(5, math.ceil(1.2 * self.smallest / cells))
-        low, high = 4 * scale, (4 + cells) * scale
-        canvas = np.full((high + low, high + low), 255, dtype=np.uint8)
-        self.family.draw_tag(canvas, 0, scale, low, low)
-        expected = np.array([[low, high], [high, high], [high, low], [low, low]]) - 0.5
-        found = self.detect(canvas)
-        if [tag.id for tag in found] != [0] or np.abs(found[0].corners - expected).max() > 0.05:
-            seen = {tag.id: tag.corners.tolist() for tag in found}
-            raise FamilyError(
-                f"with OpenCV {cv2.__version__} the tags {seen} are found in a picture of tag 0 of "
-                f"{self.family.name} with corners {expected.tolist()}: its conventions changed; "
-                "install opencv-python-headless 4.14 or 5.0"
-            )
 
 
 def _is_dim(image: NDArray[np.uint8]) -> bool:
