@@ -26,12 +26,6 @@ def test_a_parabola_is_foreseen_whatever_the_gaps():
     assert np.allclose(track.predict(times[3]), SQUARE + places[3])
 
 
-def test_what_goes_to_and_fro_is_foreseen_without_its_acceleration():
-    times = np.arange(6) / 30.0
-    track = follow([np.array([2.0 * (k % 2), 0.0]) for k in range(6)], times)
-    assert np.abs(track.predict(0.2) - track.tag.corners).max() == pytest.approx(2.0)
-
-
 def test_a_moving_limb_is_tracked_as_well_as_it_is_detected(tags, camera, detector, swing):
     tracker = TagTracker(tags.ids, detector)
     tracked, searched = [], []

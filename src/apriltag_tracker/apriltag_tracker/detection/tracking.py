@@ -55,7 +55,6 @@ class Track:
         stamp: of that picture [s].
         velocity: (4, 2) px/s of the corners, since the picture before.
         acceleration: (4, 2) px/s², zero before it is known.
-        curved: whether the acceleration counts; not where the last picture was nearer without it.
         step: s from the picture before to the last one, 0 if there is none.
         missed: pictures since then in which the tag was not found.
     """
@@ -64,31 +63,23 @@ class Track:
     stamp: float
     velocity: NDArray[np.float64] = field(default_factory=_zero)
     acceleration: NDArray[np.float64] = field(default_factory=_zero)
-    curved: bool = True
     step: float = 0.0
     missed: int = 0
 
     def predict(self, stamp: float) -> NDArray[np.float64]:
         """Return the corners (4, 2) px at a time [s]: the parabola through the last pictures."""
         gap = stamp - self.stamp
-        corners = self.tag.corners + self.velocity * gap
-        return corners + self._bent(gap) if self.curved else corners
-
-    def _bent(self, gap: float) -> NDArray[np.float64]:
-        """Return by how much the parabola leaves the straight line after a time [s], (4, 2) px."""
-        return np.asarray(self.acceleration * (0.5 * gap * (gap + self.step)))
+        bent = self.acceleration * (0.5 * gap * (gap + self.step))
+        return self.tag.corners + self.velocity * gap + bent
 
     def follow(self, tag: Tag, stamp: float) -> Track:
         """Return the track with one more picture of the tag."""
         step = stamp - self.stamp
-        moved = tag.corners - self.tag.corners
-        velocity = moved / step
-        off = moved - self.velocity * step
-        straight, bent = (float(np.abs(gap).max()) for gap in (off, off - self._bent(step)))
+        velocity = (tag.corners - self.tag.corners) / step
         acceleration = _zero()
         if self.step > 0.0 and self.missed == 0:
             acceleration = (velocity - self.velocity) * (2.0 / (step + self.step))
-        return Track(tag, stamp, velocity, acceleration, bent <= straight, step)
+        return Track(tag, stamp, velocity, acceleration, step)
 
 
 class TagTracker:
