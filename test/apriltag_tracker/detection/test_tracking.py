@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
 from apriltag_tracker.detection import Tag
 from apriltag_tracker.detection.tracking import TagTracker, Track

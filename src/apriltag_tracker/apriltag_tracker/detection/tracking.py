@@ -21,9 +21,6 @@ _ABSENT_PERIOD = 0.1
 _KEPT_FRAMES = 8
 """A tag that is missing for more frames than this is missing for long."""
 
-_LARGEST_JUMP = 1.5
-"""A duplicate that is further from the prediction than this is not the tag [sizes of a tag]."""
-
 _LONGEST_GAP = 1.0
 """After a longer time without images tracking starts anew [s]."""
 
@@ -138,7 +135,7 @@ class TagTracker:
         """Search the whole of the last image for duplicates and unknown tags, if that was left."""
         if self._postponed is not None:
             self.counts.full_searches += 1
-            self._merge(self._postponed, self._detector.detect(gray), {})
+            self._merge(self._postponed, self._detector.detect(gray))
             self._postponed = None
 
     def _search_in_full(
@@ -163,12 +160,10 @@ class TagTracker:
         if thorough:
             self._last_thorough = stamp
         self.counts.full_searches += 1
-        self._merge(found, self._detector.detect(gray, thorough), predicted)
+        self._merge(found, self._detector.detect(gray, thorough))
 
-    def _merge(
-        self, found: dict[int, Tag], more: Sequence[Tag], predicted: dict[int, NDArray[np.float64]]
-    ) -> None:
-        """Add tags of a search to those already found; take duplicates and impossible jumps out."""
+    def _merge(self, found: dict[int, Tag], more: Sequence[Tag]) -> None:
+        """Add tags of a search to those already found, but for those that are there twice."""
         by_id: dict[int, list[Tag]] = {}
         for tag in more:
             if tag.id in self._wanted:
@@ -177,11 +172,8 @@ class TagTracker:
                 self.counts.unknown[tag.id] = self.counts.unknown.get(tag.id, 0) + 1
         for tag_id, places in by_id.items():
             self.counts.duplicates += len(places) > 1
-            if tag_id in found:
-                continue
-            near = _near(places, predicted.get(tag_id)) if len(places) > 1 else places
-            if len(near) == 1:
-                found[tag_id] = near[0]
+            if tag_id not in found and len(places) == 1:
+                found[tag_id] = places[0]
                 self.counts.by_full_search += 1
 
     def _remember(self, found: dict[int, Tag], stamp: float) -> None:
@@ -193,15 +185,3 @@ class TagTracker:
             track.missed += 1
             if track.missed > _KEPT_FRAMES:
                 del self._tracks[tag_id]
-
-
-def _near(tags: Sequence[Tag], predicted: NDArray[np.float64] | None) -> list[Tag]:
-    """Return those of several tags with one id that are where it was expected."""
-    if predicted is None:
-        return []
-    middle = predicted.mean(axis=0)
-    return [
-        tag
-        for tag in tags
-        if np.hypot(*(tag.corners.mean(axis=0) - middle)) < _LARGEST_JUMP * tag.pixel_size
-    ]
