@@ -165,11 +165,10 @@ def measure_swing(frames: int, exposure: float) -> dict[str, float]:
         moments = [time.process_time()]
         frame = camera.frame(shape, Shape(shape.arc_length, 1e3 * points, 1e3 * heading))
         moments.append(time.process_time())
-        observation = tracker.observe(frame.image, k * PERIOD, search_later=True)
+        observation = tracker.observe(frame.image, k * PERIOD)
         moments.append(time.process_time())
         detector.detect(frame.image)
         moments.append(time.process_time())
-        tracker.search_again(frame.image)
         for kept, took in zip((renders, times, searches), np.diff(moments), strict=True):
             kept.append(1e3 * took)
         asked += len(frame.corners)

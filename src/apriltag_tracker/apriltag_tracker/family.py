@@ -109,15 +109,6 @@ class Family:
         cells[mask] = self.codes()[tag]
         return cells
 
-    def draw_tag(
-        self, canvas: NDArray[np.uint8], tag: int, scale: int, left: int, top: int
-    ) -> None:
-        """Draw a perfect picture of a tag, its border's upper left corner at `left`, `top` [px]."""
-        cells, rim = self.printed_cells(tag) * np.uint8(255), self.rim * scale
-        end = len(cells) * scale - rim
-        sheet = np.s_[top - rim : top + end, left - rim : left + end]
-        canvas[sheet] = np.repeat(np.repeat(cells, scale, axis=0), scale, axis=1)
-
 
 @functools.cache
 def _codes(family: Family) -> NDArray[np.uint8]:

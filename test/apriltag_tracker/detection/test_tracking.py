@@ -65,24 +65,6 @@ def test_a_jump_is_followed(tags, camera, detector, swing):
         assert np.abs(tag.corners - frame.corners[tag_id]).max() < 0.2
 
 
-def test_a_search_that_can_wait_is_left_for_later(tags, camera, detector, swing):
-    tracker = TagTracker(tags.ids, detector, 0.0)
-    frame = camera.frame(swing.shape(0.1))
-    copied = paste(frame.image.copy(), frame.corners[1], (900, 500))
-    for k, image in enumerate((frame.image, frame.image, copied)):
-        searches = tracker.counts.full_searches
-        found = {tag.id: tag for tag in tracker.track(image, k * PERIOD, search_later=True)}
-        assert found.keys() == set(tags.ids)
-        assert np.abs(found[1].corners - frame.corners[1]).max() < 0.2
-        # Nothing is known before the first picture: that search cannot wait.
-        assert tracker.counts.full_searches - searches == (k == 0)
-        tracker.search_again(image)
-        assert tracker.counts.full_searches - searches == 1
-        tracker.search_again(image)
-        assert tracker.counts.full_searches - searches == 1
-    assert tracker.counts.duplicates == 1
-
-
 def paste(image, corners, place):
     """Copy a tag with its margin to another place of the image."""
     low = np.floor(corners.min(axis=0)).astype(int) - 6

@@ -1,13 +1,13 @@
-"""Tags from frame to frame: short searches where tags are expected, full searches now and then.
+"""Tags from frame to frame: short searches where tags are expected, full searches for lost ones.
 
 A tag that was seen is looked for where the parabola through its last three pictures foresees it:
 lines are fitted to its border and its code is read there. When one is missing, the whole image is
-searched at once. While all tags are tracked, a full search runs once a second.
+searched at once, and later ten times a second.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -23,9 +23,6 @@ _KEPT_FRAMES = 8
 
 _LONGEST_GAP = 1.0
 """After a longer time without images tracking starts anew [s]."""
-
-FULL_SEARCH_PERIOD = 1.0
-"""While all tags are tracked, the whole image is searched this often [s]."""
 
 
 @dataclass
@@ -85,87 +82,52 @@ class TagTracker:
     Args:
         wanted: ids of the tags in the map; others are counted and left out.
         detector: finds and confirms tags.
-        full_search_period: s between full searches while all tags are tracked; 0 searches every
-            image in full.
     """
 
-    def __init__(
-        self,
-        wanted: Collection[int],
-        detector: Detector,
-        full_search_period: float = FULL_SEARCH_PERIOD,
-    ) -> None:
+    def __init__(self, wanted: Collection[int], detector: Detector) -> None:
         self._wanted = frozenset(wanted)
         self._detector = detector
-        self._full_search_period = full_search_period
         self.counts = TrackingCounts()
         self._tracks: dict[int, Track] = {}
-        self._postponed: dict[int, Tag] | None = None
-        """What was found in the last image, if its full search was left for later."""
-        self._last_full = self._last_thorough = -np.inf
+        self._last_thorough = -np.inf
 
-    def track(self, gray: NDArray[np.uint8], stamp: float, search_later: bool = False) -> list[Tag]:
+    def track(self, gray: NDArray[np.uint8], stamp: float) -> list[Tag]:
         """Find the tags of one frame.
 
         Args:
             gray: image (rows, columns) of uint8.
             stamp: when it was taken [s]; must grow from call to call, or tracking starts anew.
-            search_later: leave a search of the whole image that can add nothing to this answer to
-                `search_again`, for those who wait for the answer.
 
         Returns:
             Tags of the map, each id once.
         """
-        self._postponed = None
         if any(not 0.0 < stamp - track.stamp <= _LONGEST_GAP for track in self._tracks.values()):
             self._tracks.clear()
-            self._last_full = self._last_thorough = -np.inf
-        predicted = {tag: track.predict(stamp) for tag, track in self._tracks.items()}
+            self._last_thorough = -np.inf
         fresh = [tag for tag, track in self._tracks.items() if track.missed == 0]
         found: dict[int, Tag] = {}
         if fresh:
-            corners = np.array([predicted[tag] for tag in fresh])
+            corners = np.array([self._tracks[tag].predict(stamp) for tag in fresh])
             found = {tag.id: tag for tag in self._detector.confirm(gray, fresh, corners)}
         self.counts.tracked += len(found)
-        self._search_in_full(gray, stamp, found, predicted, search_later)
+        self._search_in_full(gray, stamp, found)
         self._remember(found, stamp)
         return [found[tag] for tag in sorted(found)]
 
-    def search_again(self, gray: NDArray[np.uint8]) -> None:
-        """Search the whole of the last image for duplicates and unknown tags, if that was left."""
-        if self._postponed is not None:
-            self.counts.full_searches += 1
-            self._merge(self._postponed, self._detector.detect(gray))
-            self._postponed = None
+    def _search_in_full(self, gray: NDArray[np.uint8], stamp: float, found: dict[int, Tag]) -> None:
+        """Add tags of the whole image, but for those that are there twice, if it is time to search.
 
-    def _search_in_full(
-        self,
-        gray: NDArray[np.uint8],
-        stamp: float,
-        found: dict[int, Tag],
-        predicted: dict[int, NDArray[np.float64]],
-        search_later: bool,
-    ) -> None:
-        """Search the whole image if it is time to: at once for a tag that was just lost."""
-        absent = bool(self._wanted - found.keys() - predicted.keys())
-        thorough = absent and stamp - self._last_thorough >= _ABSENT_PERIOD
-        missing = any(tag not in found for tag in predicted)
-        due = stamp - self._last_full >= self._full_search_period
-        if not (thorough or missing or due):
-            return
-        self._last_full = stamp
-        if search_later and not missing and not absent:
-            self._postponed = found
+        It is for a tag that was just lost, and now and then for one that has been missing for long.
+        """
+        absent = self._wanted - found.keys() - self._tracks.keys()
+        thorough = bool(absent) and stamp - self._last_thorough >= _ABSENT_PERIOD
+        if not thorough and self._tracks.keys() <= found.keys():
             return
         if thorough:
             self._last_thorough = stamp
         self.counts.full_searches += 1
-        self._merge(found, self._detector.detect(gray, thorough))
-
-    def _merge(self, found: dict[int, Tag], more: Sequence[Tag]) -> None:
-        """Add tags of a search to those already found, but for those that are there twice."""
         by_id: dict[int, list[Tag]] = {}
-        for tag in more:
+        for tag in self._detector.detect(gray, thorough):
             if tag.id in self._wanted:
                 by_id.setdefault(tag.id, []).append(tag)
             else:
