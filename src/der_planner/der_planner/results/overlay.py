@@ -24,11 +24,9 @@ from der_planner.arrays import Array, points_of
 from der_planner.bags.reader import BagReader
 from der_planner.bags.record import (
     NANOSECONDS,
-    PLAN_TYPE,
     STATE_TYPE,
     TRUTH_SUFFIX,
     header_stamp,
-    namespace_of,
 )
 from der_planner.bags.run import EvaluationError, RunSeries
 from der_planner.results.figures import (
@@ -172,48 +170,43 @@ class RunImages:
         Args:
             time: [s] since the first setpoint.
         """
-        state = self._nearest(STATE_TYPE, time)
-        image = self._nearest(IMAGE_TYPE, time)
-        limb = self._nearest(MARKERS_TYPE, time)
-        return Snapshot(
-            None if image is None else gray(image),
-            _NOTHING if state is None or not state.valid else points_of(state.curve),
-            _NOTHING if limb is None else points_of(limb.points),
-        )
-
-    def _nearest(self, kind: str, time: float) -> Any:
-        """Return the message of a type nearest to an instant; of markers, that of the limb."""
         when, near = self._origin + round(time * NANOSECONDS), round(NEAR * NANOSECONDS)
-        when += self._late * (kind == IMAGE_TYPE)
-        read = self._bag.messages(self._topics[kind], when - near, when + near)
-        found = [message for _, _, message in read]
-        if kind == MARKERS_TYPE:
-            markers = [marker for message in found for marker in message.markers]
-            found = [marker for marker in markers if marker.ns == LIMB_MARKER]
-        return min(found, key=lambda each: abs(header_stamp(each) - when), default=None)
+        late = when + self._late
+        read = self._bag.messages(self._topics[IMAGE_TYPE], late - near, late + near)
+        images = [message for _, _, message in read]
+        image = min(images, key=lambda each: abs(header_stamp(each) - late), default=None)
+        picture = None if image is None else gray(image)
+        curves = self._curves(when - near, when + near)
+        return Snapshot(picture, *(_nearest_curve(each, when, NEAR) for each in curves))
 
     def pictures(self) -> Iterator[tuple[float, Snapshot]]:
         """Yield the limb at each picture, with the time [s] since the first setpoint.
 
         Pictures of an encoding that is not known are left out.
         """
-        curves = {
-            header_stamp(message): points_of(message.curve)
-            for _, _, message in self._bag.messages(self._topics[STATE_TYPE])
-            if message.valid
-        }
-        limbs = {
-            header_stamp(marker): points_of(marker.points)
-            for _, _, message in self._bag.messages(self._topics[MARKERS_TYPE])
-            for marker in message.markers
-            if marker.ns == LIMB_MARKER
-        }
+        measured, planned = self._curves()
         for _, _, message in self._bag.messages(self._topics[IMAGE_TYPE]):
             picture, stamp = gray(message), header_stamp(message) - self._late
             if picture is not None:
                 time = (stamp - self._origin) / NANOSECONDS
-                measured = _nearest_curve(curves, stamp, TOGETHER)
-                yield time, Snapshot(picture, measured, _nearest_curve(limbs, stamp, NEAR))
+                seen = _nearest_curve(measured, stamp, TOGETHER)
+                yield time, Snapshot(picture, seen, _nearest_curve(planned, stamp, NEAR))
+
+    def _curves(
+        self, start: int | None = None, stop: int | None = None
+    ) -> tuple[dict[int, Array], dict[int, Array]]:
+        """Return the measured and the planned limb by stamp, logged between two times [ns]."""
+        measured = {
+            header_stamp(message): points_of(message.curve if message.valid else [])
+            for _, _, message in self._bag.messages(self._topics[STATE_TYPE], start, stop)
+        }
+        planned = {
+            header_stamp(marker): points_of(marker.points)
+            for _, _, message in self._bag.messages(self._topics[MARKERS_TYPE], start, stop)
+            for marker in message.markers
+            if marker.ns == LIMB_MARKER
+        }
+        return measured, planned
 
 
 def _nearest_curve(curves: dict[int, Array], stamp: int, within: float) -> Array:
@@ -223,26 +216,17 @@ def _nearest_curve(curves: dict[int, Array], stamp: int, within: float) -> Array
 
 
 def _topics_of(bag: BagReader, type_name: str, namespace: str) -> list[str]:
-    """Return the topics of a type that belong to a limb, neither simulated truth nor drawings.
+    """Return the topics of a type, neither simulated truth nor drawings.
 
-    Where the limb's namespace has no such topic, those that lie in no limb's namespace are
-    returned: a camera of the rig may have a name of its own.
+    They are those of the limb's namespace, if there are any: a camera of the rig may have a name of
+    its own.
     """
-    topics = bag.topics.values()
-    limbs = [
-        namespace_of(each.name) for each in topics if each.type_name in (PLAN_TYPE, STATE_TYPE)
-    ]
     named = [
         each.name
-        for each in topics
+        for each in bag.topics.values()
         if each.type_name == type_name and not each.name.endswith((TRUTH_SUFFIX, "image_annotated"))
     ]
-
-    def lies_in(topic: str, space: str) -> bool:
-        return topic.startswith(space.rstrip("/") + "/")
-
-    own = [name for name in named if lies_in(name, namespace)]
-    return own or [name for name in named if not any(lies_in(name, limb) for limb in limbs)]
+    return [name for name in named if name.startswith(f"{namespace.rstrip('/')}/")] or named
 
 
 def gray(image: Any) -> Picture | None:
