@@ -107,14 +107,6 @@ def test_a_tag_is_confirmed_only_where_it_is_and_by_its_own_code(picture):
     assert tags.confirm(image, [tag + 1 for tag in ids], corners) == []
 
 
-def test_centre_is_where_the_diagonals_cross(picture):
-    for tag in Detector().detect(picture[0])[:3]:
-        a, b, c, d = tag.corners
-        for first, last in ((a, c), (b, d)):
-            along, gap = last - first, tag.centre - first
-            assert abs(along[0] * gap[1] - along[1] * gap[0]) / np.hypot(*along) < 1e-9
-
-
 @pytest.mark.parametrize(
     ("image", "reason"),
     [

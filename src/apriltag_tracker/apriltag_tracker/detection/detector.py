@@ -62,15 +62,6 @@ class Tag:
     line_residual: float
 
     @property
-    def centre(self) -> NDArray[np.float64]:
-        """Where the diagonals cross, (2,) px: the image of the printed tag's centre."""
-        a, b, c, d = self.corners
-        along, across, gap = c - a, d - b, b - a
-        determinant = along[0] * across[1] - along[1] * across[0]
-        share = (gap[0] * across[1] - gap[1] * across[0]) / determinant
-        return np.asarray(a + share * along)
-
-    @property
     def pixel_size(self) -> float:
         """Mean length of the sides [px]."""
         a, b, c, d = self.corners.tolist()
@@ -78,7 +69,8 @@ class Tag:
 
     def is_at(self, other: Tag) -> bool:
         """Tell whether another tag is at the same place of the image."""
-        return bool(np.hypot(*(self.centre - other.centre)) < 0.5 * other.pixel_size)
+        apart = self.corners.mean(axis=0) - other.corners.mean(axis=0)
+        return bool(np.hypot(*apart) < 0.5 * other.pixel_size)
 
 
 class _Candidates(NamedTuple):
