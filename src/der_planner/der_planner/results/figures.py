@@ -212,7 +212,7 @@ def mean_error(runs: Sequence[RunSeries]) -> tuple[Array, Array, Array]:
     rows = np.full((len(runs), len(grid)), np.nan)
     for row, run in zip(rows, runs, strict=True):
         series = error_series(run)
-        row[:] = np.interp(grid, series.time, series.distance)
+        row[:] = np.interp(grid, series.time, np.linalg.norm(series.value, axis=1))
         nearest = np.searchsorted(series.time, grid).clip(1, len(series.time) - 1)
         away = np.minimum(
             np.abs(grid - series.time[nearest - 1]), np.abs(series.time[nearest] - grid)
