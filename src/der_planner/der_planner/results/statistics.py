@@ -59,11 +59,10 @@ class Comparison:
         motion: of both.
         model, baseline: with their methods, e.g. ``der optimal``.
         difference_m: positive where the model is better [m]; NaN where refused.
-        low_m, high_m: bootstrap interval of `confidence` [m]; NaN with fewer than two trials.
+        low_m, high_m: bootstrap interval of `CONFIDENCE` [m]; NaN with fewer than two trials.
         ratio: baseline over model.
         paired: trials were paired by seed.
         trials: (of the model, of the baseline).
-        confidence: of the interval.
         refused: why there is no figure; empty where there is one.
         namespace: of the limb, where the runs are of several; else empty.
         loads: mounting and payload; empty for a horizontal limb without payload.
@@ -78,7 +77,6 @@ class Comparison:
     ratio: float = float("nan")
     paired: bool = False
     trials: tuple[int, int] = (0, 0)
-    confidence: float = CONFIDENCE
     refused: str = ""
     namespace: str = ""
     loads: str = ""
