@@ -6,7 +6,6 @@
     python3 scripts/run_experiment.py --hardware my_rig.yaml --limb my_limb.yaml
 
 Sets up what is missing first (ROS 2, Python packages, the nodes); --help shows every option.
-
 Who plays differs: the nodes of the graph, which leave a bag, or this process, which leaves arrays.
 Everything else is one path.
 """
@@ -291,10 +290,9 @@ def _limb_file(trial: Trial, options: Options, progress: Progress) -> Path | Non
     prior = Limb.default().loaded(Load(mounting=options.load.mounting))
     if said := nearly_buckling(prior):
         progress.say(f"  warning: with the stiffness and mass of the default limb {said}")
-    progress.say(f"  calibrating on the twin of seed {trial.seed}")
+    progress.say(f"  calibrating on the twin of seed {trial.seed}: {path}")
     limb, _ = calibrate_twin(trial.seed, prior)
     limb.to_yaml(path)
-    progress.say(f"  calibrated: {path}")
     return path
 
 
