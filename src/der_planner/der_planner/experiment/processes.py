@@ -113,12 +113,6 @@ class Hardware:
                 raise OptionError(f"hardware file {path}: {key} must be {what}, got {value!r}")
         hardware = cls(**{key: value for key, value in content.items() if value is not None})
         hardware.hosts.update(_hosts(hardware, path))
-        named = {**hardware.tracker, **(hardware.poses or {}), **hardware.planner}
-        for key, file in named.items():
-            if key.endswith(("_map", "_file")) and file and not Path(file).exists():
-                raise OptionError(
-                    f"hardware file {path}: no file '{file}' ({key}), from the folder {Path.cwd()}"
-                )
         port = str(hardware.driver.get("port", ""))
         elsewhere = "pressure_driver" in hardware.hosts or port.startswith("tcp://")
         if hardware.twin is None and not elsewhere and not (port and Path(port).exists()):
@@ -323,7 +317,6 @@ class NodeProcess:
         name: str = "",
     ) -> None:
         self.name = name or executable
-        self.executable = executable
         self.log = folder / f"{self.name}.log"
         folder.mkdir(parents=True, exist_ok=True)
         parameter_file = folder / f"{self.name}.yaml"
