@@ -49,7 +49,7 @@ def rig(graph: Any, tmp_path: Path) -> tuple[Bench, str]:
     graph.start("der_planner", "planner", default_method="projected", limb_file=str(limb_file))
     _, url = start_page(graph, drawings=str(tmp_path / "drawings"), lease_period=3.0)
     bench = Bench(graph, bounds={})
-    graph.client.wait_ready([process.name for process in graph.processes])
+    graph.client.wait_ready([process.executable for process in graph.processes])
     return bench, url
 
 

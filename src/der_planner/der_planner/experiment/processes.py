@@ -203,9 +203,8 @@ class GraphSetup:
         board = {"port_link": port, "seed": self.seed, **language}
         twin = {"seed": self.seed, "run": self.run, **_twin_loads(self.limb)}
         driver = {"port": port, **(language if rig.twin is not None else {}), **rig.driver}
-        wired = {}
-        if wiring := driver.get("wiring"):
-            wired = {"wiring": order_of(wiring, 2 * driver.get("segment_count", 2))}
+        wiring, valves = driver.get("wiring"), 2 * driver.get("segment_count", 2)
+        wired = {"wiring": order_of(wiring, valves)} if wiring else {}
         recorder = {
             "output": str(self.bag),
             "metadata": json.dumps(self.metadata | wired),
@@ -317,6 +316,7 @@ class NodeProcess:
         name: str = "",
     ) -> None:
         self.name = name or executable
+        self.executable = executable
         self.log = folder / f"{self.name}.log"
         folder.mkdir(parents=True, exist_ok=True)
         parameter_file = folder / f"{self.name}.yaml"
