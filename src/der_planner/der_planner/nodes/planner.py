@@ -285,7 +285,7 @@ class PlannerNode(Node):
                 result = plan(
                     request.limb, request.motion, request.model, request.method,
                     nodes=self._options.nodes, start=start, progress=progress,
-                    obstacles=self._options.obstacles,
+                    obstacles=self._options.in_the_way,
                 )  # fmt: skip
             elif start is not None:
                 raise ValueError("a learned plan begins at rest: send it after this motion")
