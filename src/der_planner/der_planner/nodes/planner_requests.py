@@ -91,9 +91,7 @@ class PlannerOptions:
         "", "side of the fold that is taken; empty: the least pressure", choices=("", *BRANCHES)
     )
     path_speed: float = _parameter(0.03, "speed along a path without times [m/s]", 1e-3, 1.0)
-    path_acceleration: float = _parameter(
-        0.05, "acceleration along and across it [m/s^2]", 1e-3, 10.0
-    )
+    path_acceleration: float = _parameter(0.05, "acceleration along a path [m/s^2]", 1e-3, 10.0)
     nearest_path: bool = _parameter(
         False, "follow the nearest path in reach in place of one that leaves it", read_only=False
     )
