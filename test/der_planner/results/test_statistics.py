@@ -70,8 +70,6 @@ def test_unpaired_trials_and_single_trials():
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        ({"period_s": 6.0}, "different period: 4 s, 6 s"),
-        ({"amplitude_rad": 0.5}, "different amplitude: 0.5 rad, 0.7 rad"),
         ({"problems": ("the driver reported a fault: x",)}, "fault"),
         ({"window_s": (1.0, 8.0)}, "different windows"),
         (

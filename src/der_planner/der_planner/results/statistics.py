@@ -162,11 +162,6 @@ def why_not_comparable(results: Sequence[RunResult]) -> str:
     for run in results:
         if run.problems:
             return f"{run.bag or run.motion} (trial {run.trial}): {'; '.join(run.problems)}"
-    for name, unit in (("amplitude_rad", " rad"), ("period_s", " s"), ("cycles", "")):
-        values = sorted({round(getattr(run, name), 6) for run in results})
-        if len(values) > 1:
-            listed = ", ".join(f"{value:g}{unit}" for value in values)
-            return f"different {name.split('_')[0]}: {listed}"
     windows = {(round(run.window_s[0], 3), round(run.window_s[1], 3)) for run in results}
     if len(windows) > 1:
         return f"different windows: {', '.join(f'{a:g} to {b:g} s' for a, b in sorted(windows))}"
