@@ -30,8 +30,6 @@ class TrackingCounts:
     """How often what happened since the start."""
 
     full_searches: int = 0
-    tracked: int = 0
-    by_full_search: int = 0
     duplicates: int = 0
     unknown: dict[int, int] = field(default_factory=dict)
 
@@ -109,7 +107,6 @@ class TagTracker:
         if fresh:
             corners = np.array([self._tracks[tag].predict(stamp) for tag in fresh])
             found = {tag.id: tag for tag in self._detector.confirm(gray, fresh, corners)}
-        self.counts.tracked += len(found)
         self._search_in_full(gray, stamp, found)
         self._remember(found, stamp)
         return [found[tag] for tag in sorted(found)]
@@ -136,7 +133,6 @@ class TagTracker:
             self.counts.duplicates += len(places) > 1
             if tag_id not in found and len(places) == 1:
                 found[tag_id] = places[0]
-                self.counts.by_full_search += 1
 
     def _remember(self, found: dict[int, Tag], stamp: float) -> None:
         for tag_id, tag in found.items():
