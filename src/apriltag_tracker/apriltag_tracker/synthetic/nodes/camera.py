@@ -12,12 +12,7 @@ import numpy as np
 from ament_index_python.packages import get_package_share_directory
 from sensor_msgs.msg import CameraInfo, Image
 
-from apriltag_tracker.synthetic.camera import (
-    CameraModel,
-    Errors,
-    Optics,
-    SyntheticCamera,
-)
+from apriltag_tracker.synthetic.camera import CameraModel, Errors, Optics, SyntheticCamera
 from apriltag_tracker.synthetic.nodes import ShapeListener
 from apriltag_tracker.synthetic.shapes import Shape, constant_curvature
 from apriltag_tracker.tag_map import TagMap
@@ -36,29 +31,23 @@ class SyntheticCameraNode(ShapeListener):
         super().__init__("synthetic_camera")
         cv2.setNumThreads(1)
         share = Path(get_package_share_directory("apriltag_tracker")) / "config"
-        tag_map = declare(
-            self, "tag_map", str(share / "tags.yaml"), "YAML file: where the tags are"
-        )
-        camera = declare(
-            self,
-            "camera_file",
-            str(share / "synthetic_camera.yaml"),
-            "YAML file: lens and place of the rendered camera",
-        )
-        seed = declare(self, "seed", 0, "of noise, floor and set-up errors", at_least=0)
-        number = functools.partial(declare, self)
+        read = functools.partial(declare, self)
+        tag_map = read("tag_map", str(share / "tags.yaml"), "YAML file: where the tags are")
+        looks = "YAML file: lens and place of the rendered camera"
+        camera = read("camera_file", str(share / "synthetic_camera.yaml"), looks)
+        seed = read("seed", 0, "of noise, floor and set-up errors", at_least=0)
         blurred, lit = "blur of the lens, standard deviation in px", "light's range over its mean"
         optics = Optics(
-            noise=number("noise", Optics.noise, "noise of a pixel, grey levels", 0.0, 30.0),
-            blur=number("blur", Optics.blur, blurred, 0.0, 4.0),
-            exposure=number("exposure", Optics.exposure, "exposure time in s", 0.0, 0.1),
-            light_fall=number("light_fall", Optics.light_fall, lit, 0.0, 1.0),
+            noise=read("noise", Optics.noise, "noise of a pixel, grey levels", 0.0, 30.0),
+            blur=read("blur", Optics.blur, blurred, 0.0, 4.0),
+            exposure=read("exposure", Optics.exposure, "exposure time in s", 0.0, 0.1),
+            light_fall=read("light_fall", Optics.light_fall, lit, 0.0, 1.0),
         )
         surveyed, mounted = "how far fixed tags are from the tag map, in m", "the same of limb tags"
         errors = Errors(
-            survey=number("survey_error", 0.0, surveyed, 0.0, 0.01),
-            mounting=number("mounting_error", 0.0, mounted, 0.0, 0.01),
-            mounting_angle=number("mounting_angle_error", 0.0, "limb tags' turn, in rad", 0.0, 0.3),
+            survey=read("survey_error", 0.0, surveyed, 0.0, 0.01),
+            mounting=read("mounting_error", 0.0, mounted, 0.0, 0.01),
+            mounting_angle=read("mounting_angle_error", 0.0, "limb tags' turn, in rad", 0.0, 0.3),
         )
         check_overrides(self)
         tags = TagMap.from_yaml(str(tag_map))
