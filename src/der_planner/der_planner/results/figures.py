@@ -10,8 +10,8 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
+from matplotlib import style
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
@@ -24,6 +24,7 @@ from der_planner.results.statistics import learning_curves
 from der_planner.results.tables import CASE, several_limbs
 
 FORMATS = ("png", "pdf")
+STYLE = Path(__file__).parents[1] / "data" / "paper.mplstyle"
 CM = 100.0
 COLUMN = 3.5
 """Width of a column of a two-column paper [inch]."""
@@ -63,24 +64,7 @@ def colours_of(runs: Sequence[RunSeries]) -> dict[str, tuple[float, ...]]:
 
 def paper_style() -> AbstractContextManager[None]:
     """Set font sizes and line widths of a two-column paper, without touching the caller's."""
-    return mpl.rc_context(
-        {
-            "font.size": 8,
-            "axes.titlesize": 8,
-            "axes.labelsize": 8,
-            "legend.fontsize": 7,
-            "xtick.labelsize": 7,
-            "ytick.labelsize": 7,
-            "lines.linewidth": 1.2,
-            "axes.linewidth": 0.6,
-            "axes.spines.top": False,
-            "axes.spines.right": False,
-            "legend.frameon": False,
-            "pdf.fonttype": 42,
-            "savefig.dpi": 160,
-            "figure.constrained_layout.use": True,
-        }
-    )
+    return style.context(STYLE)
 
 
 def save(figure: Figure, folder: Path, name: str) -> list[Path]:
