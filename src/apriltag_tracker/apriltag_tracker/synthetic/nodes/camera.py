@@ -14,7 +14,7 @@ from sensor_msgs.msg import CameraInfo, Image
 
 from apriltag_tracker.synthetic.camera import CameraModel, Errors, Optics, SyntheticCamera
 from apriltag_tracker.synthetic.nodes import ShapeListener
-from apriltag_tracker.synthetic.shapes import Shape, constant_curvature
+from apriltag_tracker.synthetic.shapes import Shape
 from apriltag_tracker.tag_map import TagMap
 from limb_interfaces import qos, stamps, topics
 from limb_interfaces.parameters import check_overrides, declare
@@ -54,9 +54,6 @@ class SyntheticCameraNode(ShapeListener):
         self._camera = SyntheticCamera(
             CameraModel.from_yaml(str(camera)), tags, optics, errors, int(seed)
         )
-        # Draw once, so that no frame of a run waits for a compiler.
-        straight = constant_curvature(tags.segment_lengths, [0.0] * len(tags.segment_lengths))
-        self._camera.frame(straight, straight)
         self._before: tuple[int, Shape] | None = None
         self._image = self._image_message()
         size = self._camera.model.intrinsics
