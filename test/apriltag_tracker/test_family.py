@@ -94,4 +94,4 @@ def test_a_limb_with_another_family_is_tracked(tags, model, swing, name):
 
 def test_a_detector_of_another_family_than_the_map_is_refused(tags, model):
     with pytest.raises(ValueError, match=r"tag25h9 .* tag36h11"):
-        LimbTracker(tags, model.intrinsics, detector=Detector(family="tag25h9"))
+        LimbTracker(tags, model.intrinsics, detector=Detector(family=FAMILIES["tag25h9"]))

@@ -118,11 +118,3 @@ def test_a_tag_is_confirmed_only_where_it_is_and_by_its_own_code(picture):
 def test_what_is_no_image_is_refused(image, reason):
     with pytest.raises(ValueError, match=reason):
         Detector().detect(image)
-
-
-@pytest.mark.parametrize(
-    ("bits", "name", "safe"), [(-1, "tag36h11", 2), (3, "tag36h11", 2), (1, "tag16h5", 0)]
-)
-def test_more_forgiven_cells_than_are_safe_are_refused(bits, name, safe):
-    with pytest.raises(ValueError, match=f"0 to {safe} with {name}"):
-        Detector(correct_bits=bits, family=name)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from apriltag_tracker.camera.images import check_grey
 from apriltag_tracker.detection.codes import code_table, nearest_tag, read_codes
 from apriltag_tracker.detection.edges import refine_quads
-from apriltag_tracker.family import Family, named
+from apriltag_tracker.family import TAG36H11, Family
 
 SMALLEST_TAG = 14.0
 """A shorter side is not looked for [px]; a cell of such a tag is 1.75 px wide."""
@@ -101,30 +101,18 @@ class Detector:
             once in 790 000 at 1, once in 44 000 at 2; of tag25h9 once in 240 000 at 0; of tag16h5
             once in 550 at 0; of tagStandard41h12 once in 300 000 at 2; of tagStandard52h13 once in
             980 000 at 3, once in 78 000 at 4.
-        family: of the tags, or its name.
-
-    Raises:
-        ValueError: a tag smaller than can be read, or more forgiven cells than are safe.
+        family: of the tags.
     """
 
     def __init__(
         self,
         smallest: float = SMALLEST_TAG,
         correct_bits: int | None = None,
-        family: Family | str = "tag36h11",
+        family: Family = TAG36H11,
     ) -> None:
-        if smallest < 8.0:
-            raise ValueError(f"smallest tag of {smallest} px: 8 px or more can be read")
-        self.family = named(family) if isinstance(family, str) else family
-        if correct_bits is None:
-            correct_bits = self.family.correct_bits
-        if not 0 <= correct_bits <= self.family.most_corrected:
-            raise ValueError(
-                f"correct_bits {correct_bits}: 0 to {self.family.most_corrected} with "
-                f"{self.family.name}; with more, pictures without a tag show some"
-            )
+        self.family = family
         self.smallest = smallest
-        self.correct_bits = correct_bits
+        self.correct_bits = family.correct_bits if correct_bits is None else correct_bits
 
     def detect(self, gray: NDArray[np.uint8], thorough: bool = False) -> list[Tag]:
         """Find the tags of an image (rows, columns) of uint8; an id may be there more than once.
