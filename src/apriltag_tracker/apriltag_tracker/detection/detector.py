@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -73,24 +73,6 @@ class Tag:
         return bool(np.hypot(*apart) < 0.5 * other.pixel_size)
 
 
-class _Candidates(NamedTuple):
-    """Quadrilaterals of an image.
-
-    Attributes:
-        corners: (n, 4, 2) px.
-        covariances: (n, 8, 8) px², with what blended cells shift.
-        residuals: (n,) RMS distance of the crossings from the lines [px].
-        codes: (n,) of `read_codes`.
-        good: (n,) whether there is a straight border around clear cells that is no mirror image.
-    """
-
-    corners: NDArray[np.float64]
-    covariances: NDArray[np.float64]
-    residuals: NDArray[np.float64]
-    codes: NDArray[np.uint64]
-    good: NDArray[np.bool_]
-
-
 class Detector:
     """Finds all tags of an image.
 
@@ -151,11 +133,11 @@ class Detector:
             ValueError: not such an image, or an empty one.
         """
         seen = self._candidates(self._read_as(gray), np.ascontiguousarray(corners))
-        wrong = np.bitwise_count(code_table(self.family)[0, list(ids)] ^ seen.codes)
-        good = seen.good & (wrong <= self.correct_bits + 1)
+        expected = code_table(self.family)[0]
         return [
-            Tag(ids[i], seen.corners[i], seen.covariances[i], float(seen.residuals[i]))
-            for i in np.flatnonzero(good).tolist()
+            replace(tag, id=ids[i])
+            for i, code, tag in seen
+            if np.bitwise_count(expected[ids[i]] ^ code) <= self.correct_bits + 1
         ]
 
     def _read_as(self, gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -165,22 +147,24 @@ class Detector:
 
     def _read(self, image: NDArray[np.uint8], quads: NDArray[np.float64]) -> list[Tag]:
         """Read the codes of quadrilaterals (n, 4, 2) px, in whatever direction."""
-        seen = self._candidates(image, quads)
         tags = []
-        for i in np.flatnonzero(seen.good).tolist():
-            tag, turn, wrong = nearest_tag(seen.codes[i], self.family)
+        for _, code, seen in self._candidates(image, quads):
+            tag, turn, wrong = nearest_tag(code, self.family)
             if wrong <= self.correct_bits:
                 order = (np.arange(4) + turn) % 4
                 both = np.stack([2 * order, 2 * order + 1], axis=1).ravel()
-                corners, covariance = (
-                    seen.corners[i][order],
-                    seen.covariances[i][np.ix_(both, both)],
-                )
-                tags.append(Tag(tag, corners, covariance, float(seen.residuals[i])))
+                covariance = seen.covariance[np.ix_(both, both)]
+                tags.append(Tag(tag, seen.corners[order], covariance, seen.line_residual))
         return tags
 
-    def _candidates(self, image: NDArray[np.uint8], quads: NDArray[np.float64]) -> _Candidates:
-        """Refine quadrilaterals (n, 4, 2) px and read their cells."""
+    def _candidates(
+        self, image: NDArray[np.uint8], quads: NDArray[np.float64]
+    ) -> Iterator[tuple[int, np.uint64, Tag]]:
+        """Refine quadrilaterals (n, 4, 2) px and read their cells.
+
+        Those are yielded that have a straight border around clear cells and are no mirror images:
+        with their place in ``quads``, their code, and as tags that have no id yet.
+        """
         corners, covariances, residuals, found = refine_quads(image, quads, _SEARCH)
         misfits, codes = read_codes(image, corners, self.family)
         along, across = corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1]
@@ -192,7 +176,8 @@ class Detector:
         cells = np.sqrt(0.5 * np.abs(turned)) / self.family.border_cells
         shifts = _BLENDED * np.maximum(misfits - _SHARP_MISFIT, 0.0) * cells
         covariances[good] += shifts[good, None, None] ** 2 * np.eye(8)
-        return _Candidates(corners, covariances, residuals, codes, good)
+        for i in np.flatnonzero(good).tolist():
+            yield i, codes[i], Tag(-1, corners[i], covariances[i], float(residuals[i]))
 
 
 def _is_dim(image: NDArray[np.uint8]) -> bool:
