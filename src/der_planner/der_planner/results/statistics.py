@@ -60,7 +60,6 @@ class Comparison:
         model, baseline: with their methods, e.g. ``der optimal``.
         difference_m: positive where the model is better [m]; NaN where refused.
         low_m, high_m: bootstrap interval of `CONFIDENCE` [m]; NaN with fewer than two trials.
-        ratio: baseline over model.
         paired: trials were paired by seed.
         trials: (of the model, of the baseline).
         refused: why there is no figure; empty where there is one.
@@ -74,7 +73,6 @@ class Comparison:
     difference_m: float = float("nan")
     low_m: float = float("nan")
     high_m: float = float("nan")
-    ratio: float = float("nan")
     paired: bool = False
     trials: tuple[int, int] = (0, 0)
     refused: str = ""
@@ -199,7 +197,6 @@ def _compared(pair: Comparison, runs: list[RunResult], others: list[RunResult]) 
         difference_m=float(two.mean() - one.mean()),
         low_m=low,
         high_m=high,
-        ratio=float(two.mean() / one.mean()),
         paired=differences is not None,
     )
 
