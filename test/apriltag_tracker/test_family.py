@@ -9,7 +9,6 @@ import pyapriltags.apriltags as c_library
 import pytest
 
 from apriltag_tracker import family
-from apriltag_tracker.detection import Detector
 from apriltag_tracker.family import FAMILIES, TAG36H11
 from apriltag_tracker.pipeline import LimbTracker
 from apriltag_tracker.synthetic.camera import Optics, SyntheticCamera
@@ -90,8 +89,3 @@ def test_a_limb_with_another_family_is_tracked(tags, model, swing, name):
         if placed.tag.id in fixed:
             assert np.hypot(*(placed.pose[:2] - fixed[placed.tag.id].position[:2])) < 1e-4
     assert len(observation.tags) == len(other.ids)
-
-
-def test_a_detector_of_another_family_than_the_map_is_refused(tags, model):
-    with pytest.raises(ValueError, match=r"tag25h9 .* tag36h11"):
-        LimbTracker(tags, model.intrinsics, detector=Detector(family=FAMILIES["tag25h9"]))

@@ -56,7 +56,7 @@ class LimbTracker:
         tags: the tag map.
         intrinsics: of the camera.
         options: how it works.
-        detector: finds the tags.
+        detector: finds the tags, of the map's family.
     """
 
     def __init__(
@@ -74,13 +74,7 @@ class LimbTracker:
         self._flat.update({tag.id: (tag.position[2], tag.size) for tag in tags.world})
         self._world_positions = np.array([tag.position[:2] for tag in tags.world]).reshape(-1, 2)
         self._world_size = max((tag.size for tag in tags.world), default=1.0)
-        detector = detector or Detector(family=tags.family)
-        if detector.family != tags.family:
-            raise ValueError(
-                f"the detector reads {detector.family.name} but the tag map is of "
-                f"{tags.family.name}: make it by Detector(family=tag_map.family)"
-            )
-        self.tracker = TagTracker(self._flat, detector)
+        self.tracker = TagTracker(self._flat, detector or Detector(family=tags.family))
         self.world = WorldPose(tags, intrinsics)
         self.follower = LimbFollower(tags, self.options)
         self.size_error = 0.0
