@@ -56,10 +56,6 @@ class SyntheticCameraNode(ShapeListener):
         )
         self._before: tuple[int, Shape] | None = None
         self._image = self._image_message()
-        size = self._camera.model.intrinsics
-        self._pixels = np.frombuffer(self._image.data, np.uint8).reshape(size.height, size.width)
-        """The picture in the message, which is drawn anew for every shape."""
-        self._camera.prepare(self._pixels)
         self._info = self._info_message()
         self._images = self.create_publisher(Image, topics.IMAGE, qos.SENSOR_DATA)
         self._infos = self.create_publisher(CameraInfo, topics.CAMERA_INFO, qos.LATCHED)
@@ -71,8 +67,6 @@ class SyntheticCameraNode(ShapeListener):
         size = self._camera.model.intrinsics
         message = Image(height=size.height, width=size.width, encoding="mono8", step=size.width)
         message.header.frame_id = FRAME
-        # rclpy copies an array.array in one piece; other sequences go through element by element.
-        message.data = array.array("B", bytes(size.width * size.height))
         return message
 
     def _info_message(self) -> CameraInfo:
@@ -95,15 +89,15 @@ class SyntheticCameraNode(ShapeListener):
 
     def show(self, stamp: int, shape: Shape) -> None:
         """Render the shape."""
-        # Into the message itself, where everything but the limb has been drawn meanwhile.
-        self._camera.frame(shape, self._velocity(stamp, shape))
+        picture = self._camera.frame(shape, self._velocity(stamp, shape)).image
+        # rclpy copies an array.array in one piece; other sequences go through element by element.
+        self._image.data = array.array("B", picture.tobytes())
         self._image.header.stamp = stamps.stamp_from_nanoseconds(stamp)
         self._images.publish(self._image)
         self._before = (stamp, shape)
         if time.monotonic() - self._last_info > _INFO_PERIOD:
             self._info.header.stamp = self._image.header.stamp
             self._publish_info()
-        self._camera.prepare(self._pixels)
 
     def _velocity(self, stamp: int, shape: Shape) -> Shape | None:
         """Return how fast the limb moves, from this shape and the one before."""
