@@ -16,6 +16,7 @@ import numpy as np
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
 
+from benchmarks import cpu_time
 from benchmarks.driver import Rig, busy_loops
 from der_msgs.msg import ChamberPressures, MotionCommand, PressureSetpoint, PressureState
 from der_planner.experiment.processes import PAGE_TOKEN, GraphError, GraphSetup
@@ -129,9 +130,9 @@ class PageGraph(Rig):
     def measure_cpu(self, seconds: float) -> float:
         """Return the share of a core [%] that the page's process uses during some seconds."""
         page, begin = self.graph.processes["page"], time.monotonic()
-        before = page.measure_cpu()
+        before = cpu_time(page.pid)
         self.client.spin(seconds)
-        return 100.0 * (page.measure_cpu() - before) / (time.monotonic() - begin)
+        return 100.0 * (cpu_time(page.pid) - before) / (time.monotonic() - begin)
 
 
 @contextlib.contextmanager

@@ -16,6 +16,7 @@ import numpy as np
 from geometry_msgs.msg import Point
 from rclpy.serialization import serialize_message
 
+from benchmarks import cpu_time
 from der_msgs.msg import (
     LimbState,
     PressurePlan,
@@ -82,9 +83,9 @@ def record_images(seconds: float) -> dict[str, float]:
     """Record 720p mono8 images and six other topics at 30 Hz; count what is missing."""
     with _recording(seconds) as (folder, recorder, source):
         time.sleep(2.0)
-        begin, used = time.monotonic(), recorder.measure_cpu()
+        begin, used = time.monotonic(), cpu_time(recorder.pid)
         source.wait(seconds + 60.0)
-        cpu = (recorder.measure_cpu() - used) / (time.monotonic() - begin)
+        cpu = (cpu_time(recorder.pid) - used) / (time.monotonic() - begin)
         recorder.stop(timeout=30.0)
         with BagReader(folder / "bag") as bag:
             counts = {n: t.message_count for n, t in bag.topics.items()}

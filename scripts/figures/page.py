@@ -16,7 +16,6 @@ from PIL import Image
 
 from benchmarks.page import PageGraph, page_graph
 from der_msgs.msg import PressureState
-from der_planner.experiment.console import folder_argument
 from der_planner.results import evaluate_run, format_table, load_run, summarise
 from der_planner.results.overlay import write_video
 from workspace_setup.basics import ROOT
@@ -154,7 +153,7 @@ def draw_states(photographer: Photographer) -> None:
 def main() -> int:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("folder", nargs="?", type=folder_argument, default=DOC)
+    parser.add_argument("folder", nargs="?", type=Path, default=DOC)
     parser.add_argument("--states", action="store_true", help="every state on every screen instead")
     given = parser.parse_args()
     given.folder.mkdir(parents=True, exist_ok=True)

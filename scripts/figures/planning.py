@@ -14,7 +14,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 
-from der_planner.experiment.console import folder_argument
 from der_planner.limb import Limb
 from der_planner.model import ArcModel
 from der_planner.planning import Motion, Plan, Workspace, plan
@@ -123,9 +122,7 @@ def _label(axes: Axes, what: str) -> None:
 def main() -> int:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument(
-        "--out", type=folder_argument, default=FOLDER, help="folder for the pictures"
-    )
+    parser.add_argument("--out", type=Path, default=FOLDER, help="folder for the pictures")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     for name, draw in (

@@ -13,7 +13,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from benchmarks.rod import cantilever, run_elastica
-from der_planner.experiment.console import folder_argument
 from der_planner.limb import Limb
 from der_planner.rod import Rod
 from workspace_setup.basics import ROOT
@@ -130,7 +129,7 @@ def stability(folder: Path) -> None:
 def main() -> int:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("folder", nargs="?", type=folder_argument, default=FOLDER)
+    parser.add_argument("folder", nargs="?", type=Path, default=FOLDER)
     folder = parser.parse_args().folder
     folder.mkdir(parents=True, exist_ok=True)
     for draw in (statics, dynamics, stability):

@@ -9,22 +9,12 @@ import pyapriltags.apriltags as c_library
 import pytest
 
 from apriltag_tracker import family
-from apriltag_tracker.detection import Detector, detector
 from apriltag_tracker.family import FAMILIES, TAG36H11
 from apriltag_tracker.pipeline import LimbTracker
 from apriltag_tracker.synthetic.camera import Optics, SyntheticCamera
 
 EACH = pytest.mark.parametrize("each", FAMILIES.values(), ids=FAMILIES)
 STANDARD = ("tagStandard41h12", "tagStandard52h13")
-
-
-@pytest.mark.parametrize("name", ["tag36h11", "tagStandard41h12"])
-def test_codes_that_are_turned_or_damaged_are_noticed(monkeypatch, name):
-    wrong = np.roll(FAMILIES[name].codes(), 1, axis=1)
-    monkeypatch.setattr(family, "_codes", lambda _: wrong)
-    monkeypatch.setattr(detector, "_CHECKED", set())
-    with pytest.raises(family.FamilyError, match="or damaged"):
-        Detector(family=name)
 
 
 @EACH
@@ -41,6 +31,11 @@ def test_codes_differ_in_as_many_cells_as_stated_however_they_are_turned(each):
             distance[np.arange(len(some)), some] = 99
         nearest.append(distance.min())
     assert min(nearest) >= int(each.name.rpartition("h")[2])
+
+
+def test_codes_that_no_other_library_here_has_are_the_published_ones():
+    bits = FAMILIES["tag36h10"].codes()[0]
+    assert int("".join(map(str, bits)), 2) == 0x1CA92A687
 
 
 @EACH
@@ -94,8 +89,3 @@ def test_a_limb_with_another_family_is_tracked(tags, model, swing, name):
         if placed.tag.id in fixed:
             assert np.hypot(*(placed.pose[:2] - fixed[placed.tag.id].position[:2])) < 1e-4
     assert len(observation.tags) == len(other.ids)
-
-
-def test_a_detector_of_another_family_than_the_map_is_refused(tags, model):
-    with pytest.raises(ValueError, match=r"tag25h9 .* tag36h11"):
-        LimbTracker(tags, model.intrinsics, detector=Detector(family="tag25h9"))

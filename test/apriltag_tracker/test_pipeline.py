@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from apriltag_tracker.detection import Detector, edges
-from apriltag_tracker.pipeline import LimbTracker, TrackerOptions, warm_up
-from apriltag_tracker.pose.shape import Uncertainty
+from apriltag_tracker.detection import Detector
+from apriltag_tracker.pipeline import LimbTracker
+from apriltag_tracker.pose.shape import FollowerOptions, Uncertainty
 from apriltag_tracker.synthetic.camera import Errors, Optics, SyntheticCamera
 
 pytestmark = pytest.mark.slow
@@ -67,7 +67,7 @@ def test_the_tip_is_as_sure_as_it_says_with_few_fixed_tags(straight_tags, model,
 
 def test_set_up_errors_stay_within_the_systematic_part(straight_tags, model, swing):
     uncertainty = Uncertainty(survey=5e-4, height=0.0, mounting=4e-4, mounting_angle=5e-3)
-    options = TrackerOptions(uncertainty=uncertainty, reject_beyond=0.01)
+    options = FollowerOptions(uncertainty=uncertainty, reject_beyond=0.01)
     normalised = []
     for seed in range(8):
         errors = Errors(survey=5e-4, mounting=4e-4, mounting_angle=5e-3)
@@ -80,7 +80,7 @@ def test_set_up_errors_stay_within_the_systematic_part(straight_tags, model, swi
 
 
 def test_gaps_are_bridged_marked_and_then_given_up(straight_tags, model, camera, swing):
-    tracker = LimbTracker(straight_tags, model.intrinsics, TrackerOptions(bridge_frames=3))
+    tracker = LimbTracker(straight_tags, model.intrinsics, FollowerOptions(bridge_frames=3))
     run(tracker, camera, swing, 20)
     known = tracker.observe(camera.frame(swing.shape(20 * PERIOD)).image, 20 * PERIOD)
     spread = np.trace(known.estimate.tip_covariance)
@@ -125,8 +125,3 @@ def test_tags_at_another_height_or_place_are_left_out_by_name(straight_tags, mod
     assert tracker.follower.misplaced == 1
     error = observation.estimate.tip - swing.shape(0.3).points[-1]
     assert np.hypot(*error) < 1e-3
-
-
-def test_warming_up_leaves_no_kernel_for_the_first_image(detector):
-    warm_up(detector)
-    assert len(edges.refine_quads.signatures) == 1

@@ -33,7 +33,7 @@ def rasterise(page, dots_per_mm: float) -> np.ndarray:
 @pytest.mark.parametrize("name", ["tag36h11", "tagStandard41h12"])
 def test_printed_tags_have_their_size_and_direction(tags, name):
     dots, tags = 4.0, dataclasses.replace(tags, family=FAMILIES[name])
-    detector = Detector(family=name)
+    detector = Detector(family=FAMILIES[name])
     found = {
         tag.id: tag for page in tag_pages(tags) for tag in detector.detect(rasterise(page, dots))
     }

@@ -25,6 +25,7 @@ from apriltag_tracker.pipeline import LimbTracker
 from apriltag_tracker.synthetic.camera import CameraModel, Optics, SyntheticCamera
 from apriltag_tracker.synthetic.shapes import Shape, constant_curvature
 from apriltag_tracker.tag_map import TagMap
+from benchmarks import cpu_time
 from benchmarks.tracker.renderer import Scene, render
 from der_msgs.msg import ChamberPressures, LimbState
 from der_planner.experiment.client import GraphClient
@@ -165,11 +166,10 @@ def measure_swing(frames: int, exposure: float) -> dict[str, float]:
         moments = [time.process_time()]
         frame = camera.frame(shape, Shape(shape.arc_length, 1e3 * points, 1e3 * heading))
         moments.append(time.process_time())
-        observation = tracker.observe(frame.image, k * PERIOD, search_later=True)
+        observation = tracker.observe(frame.image, k * PERIOD)
         moments.append(time.process_time())
         detector.detect(frame.image)
         moments.append(time.process_time())
-        tracker.search_again(frame.image)
         for kept, took in zip((renders, times, searches), np.diff(moments), strict=True):
             kept.append(1e3 * took)
         asked += len(frame.corners)
@@ -227,11 +227,11 @@ def measure_graph(seconds: float) -> dict[str, float]:
             _press(client)
             client.wait_for(lambda: len(states) > 60, 60.0, "the tracker")
             states.clear()
-            before = {name: node.measure_cpu() for name, node in nodes.items()}
+            before = {name: cpu_time(node.pid) for name, node in nodes.items()}
             started = time.monotonic()
             client.spin(seconds)
             took = time.monotonic() - started
-            cpu = {name: node.measure_cpu() - before[name] for name, node in nodes.items()}
+            cpu = {name: cpu_time(node.pid) - before[name] for name, node in nodes.items()}
         finally:
             for node in nodes.values():
                 node.stop()

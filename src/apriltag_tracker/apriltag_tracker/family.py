@@ -18,10 +18,6 @@ from numpy.typing import NDArray
 _STANDARD_CODES = Path(__file__).parent / "data" / "standard_families.npz"
 
 
-class FamilyError(RuntimeError):
-    """OpenCV's dictionary or detector does not behave as this package needs it to."""
-
-
 @dataclass(frozen=True)
 class Family:
     """A family of tags with a border one cell wide around a square code.
@@ -34,7 +30,6 @@ class Family:
         name: as the AprilTag library calls it.
         code_cells: cells along the edge of the code inside of the border.
         tag_count: how many tags there are.
-        first_code: bits of the printed tag 0, row by row from its upper left, as published.
         correct_bits: wrong cells of a code that are forgiven in a search, if nothing else is said.
         most_corrected: the same at most: with more, pictures without a tag show some.
         largest_misfit: RMS distance of the cells from plain black and white above which a code is
@@ -45,7 +40,6 @@ class Family:
     name: str
     code_cells: int
     tag_count: int
-    first_code: int
     correct_bits: int
     most_corrected: int
     largest_misfit: float
@@ -115,30 +109,6 @@ class Family:
         cells[mask] = self.codes()[tag]
         return cells
 
-    def draw_tag(
-        self, canvas: NDArray[np.uint8], tag: int, scale: int, left: int, top: int
-    ) -> None:
-        """Draw a perfect picture of a tag, its border's upper left corner at `left`, `top` [px]."""
-        cells, rim = self.printed_cells(tag) * np.uint8(255), self.rim * scale
-        end = len(cells) * scale - rim
-        sheet = np.s_[top - rim : top + end, left - rim : left + end]
-        canvas[sheet] = np.repeat(np.repeat(cells, scale, axis=0), scale, axis=1)
-
-    def check_code_of_tag_0(self) -> None:
-        """Compare tag 0 with the family's published code.
-
-        Raises:
-            FamilyError: they differ, so every yaw would be wrong.
-        """
-        value = int("".join(str(bit) for bit in self.codes()[0]), 2)
-        if value == self.first_code:
-            return
-        raise FamilyError(
-            f"tag 0 of {self.name} reads {value:#x} and not {self.first_code:#x} with OpenCV "
-            f"{cv2.__version__}: its codes are turned in another way than this package knows, or "
-            "damaged; install the package and opencv-python-headless 4.14 or 5.0 again"
-        )
-
 
 @functools.cache
 def _codes(family: Family) -> NDArray[np.uint8]:
@@ -159,12 +129,12 @@ def _codes(family: Family) -> NDArray[np.uint8]:
 _STRONG, _CLEAR = 0.6, 0.35
 
 _ALL = (
-    Family("tag36h11", 6, 587, 0xD5D628584, 1, 2, _STRONG, cv2.aruco.DICT_APRILTAG_36h11),
-    Family("tag36h10", 6, 2320, 0x1CA92A687, 1, 1, _STRONG, cv2.aruco.DICT_APRILTAG_36h10),
-    Family("tag25h9", 5, 35, 0x155CBF1, 0, 1, _CLEAR, cv2.aruco.DICT_APRILTAG_25h9),
-    Family("tag16h5", 4, 30, 0x231B, 0, 0, _CLEAR, cv2.aruco.DICT_APRILTAG_16h5),
-    Family("tagStandard41h12", 3, 2115, 0x1BC2788B1A4, 2, 2, _STRONG, None),
-    Family("tagStandard52h13", 4, 48714, 0x406B98AB8AA9A, 3, 4, _STRONG, None),
+    Family("tag36h11", 6, 587, 1, 2, _STRONG, cv2.aruco.DICT_APRILTAG_36h11),
+    Family("tag36h10", 6, 2320, 1, 1, _STRONG, cv2.aruco.DICT_APRILTAG_36h10),
+    Family("tag25h9", 5, 35, 0, 1, _CLEAR, cv2.aruco.DICT_APRILTAG_25h9),
+    Family("tag16h5", 4, 30, 0, 0, _CLEAR, cv2.aruco.DICT_APRILTAG_16h5),
+    Family("tagStandard41h12", 3, 2115, 2, 2, _STRONG, None),
+    Family("tagStandard52h13", 4, 48714, 3, 4, _STRONG, None),
 )
 
 FAMILIES = {family.name: family for family in _ALL}

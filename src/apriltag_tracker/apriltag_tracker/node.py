@@ -17,14 +17,9 @@ from sensor_msgs.msg import CameraInfo, Image
 from apriltag_tracker.camera import CameraError, Intrinsics
 from apriltag_tracker.camera.images import ImageError, ImageReader, Source, open_source
 from apriltag_tracker.detection import SMALLEST_TAG, Detector
-from apriltag_tracker.pipeline import (
-    LimbObservation,
-    LimbTracker,
-    PlacedTag,
-    TrackerOptions,
-    warm_up,
-)
+from apriltag_tracker.pipeline import LimbObservation, LimbTracker, PlacedTag
 from apriltag_tracker.pose.node import LimbStateNode, transform
+from apriltag_tracker.pose.shape import FollowerOptions
 from apriltag_tracker.reports import NO_CALIBRATION, ImageWatch, draw_observation
 from apriltag_tracker.tag_map import TagMap
 from der_msgs.msg import TagDetection
@@ -54,8 +49,6 @@ class TrackerNode(LimbStateNode):
         self._options = self._declare_options()
         self._detector = self._make_detector()
         check_overrides(self)
-        # Every kernel is loaded or compiled before the first image.
-        warm_up(self._detector)
         self._tracker: LimbTracker | None = None
         self._reader = ImageReader()
         self._frame = ""
@@ -92,18 +85,11 @@ class TrackerNode(LimbStateNode):
         lens = self._tracker.intrinsics
         return open_source(source, rate, size=(lens.width, lens.height))
 
-    def _declare_options(self) -> TrackerOptions:
-        options = self.declare_following(TrackerOptions())
+    def _declare_options(self) -> FollowerOptions:
+        options = self.declare_following(FollowerOptions())
         heights = "of limb tags' heights, m"
         height = declare(self, "height_sigma", options.uncertainty.height, heights, 0.0, 0.1)
-        period = "s between searches of the whole image; 0 searches every image in full"
-        return replace(
-            options,
-            uncertainty=replace(options.uncertainty, height=height),
-            full_search_period=declare(
-                self, "full_search_period", options.full_search_period, period, 0.0, 60.0
-            ),
-        )
+        return replace(options, uncertainty=replace(options.uncertainty, height=height))
 
     def _make_detector(self) -> Detector:
         family = self._map.family
@@ -178,13 +164,12 @@ class TrackerNode(LimbStateNode):
             self._fail(stamp, self._watch.calibration_problem or NO_CALIBRATION)
             return
         try:
-            observation = self._tracker.observe(gray, stamps.seconds(stamp), search_later=True)
+            observation = self._tracker.observe(gray, stamps.seconds(stamp))
         except (ValueError, ArithmeticError, cv2.error) as error:
             self._fail(stamp, str(error))
             return
         latency = self._publish(observation, gray, stamp)
         self._watch.observed(observation, latency, time.perf_counter() - started)
-        self._tracker.search_again(gray)
 
     def _fail(self, stamp: Time, problem: str) -> None:
         """Say at once that this image gives no state, and why."""

@@ -10,29 +10,17 @@ from numpy.typing import NDArray
 
 from apriltag_tracker.camera import CameraError, CameraPose, Intrinsics
 from apriltag_tracker.detection import Detector, Tag
-from apriltag_tracker.detection.tracking import FULL_SEARCH_PERIOD, TagTracker
+from apriltag_tracker.detection.tracking import TagTracker
 from apriltag_tracker.pose.following import LimbFollower, survey_errors
 from apriltag_tracker.pose.shape import FollowerOptions, LimbEstimate, PlanarTag, centreline_pose
 from apriltag_tracker.pose.world import WorldPose, locate
-from apriltag_tracker.tag_map import LimbTag, TagMap, WorldTag
+from apriltag_tracker.tag_map import TagMap
 
 _SIZE_MEMORY = 20
 """Pictures over which the size of the limb's tags is averaged."""
-
-
-@dataclass(frozen=True)
-class TrackerOptions(FollowerOptions):
-    """How the tracker works.
-
-    Attributes:
-        largest_misfit: RMS distance of a tag's corners from a square of its size [m, as a share of
-            the size] above which it is not at the height it should be at.
-        full_search_period: s between searches of the whole image while all tags are tracked; 0
-            searches every image in full.
-    """
-
-    largest_misfit: float = 0.06
-    full_search_period: float = FULL_SEARCH_PERIOD
+_LARGEST_MISFIT = 0.06
+"""RMS distance of a tag's corners from a square of its size [m, as a share of the size] above which
+it is not at the height it should be at."""
 
 
 @dataclass(frozen=True)
@@ -68,45 +56,36 @@ class LimbTracker:
         tags: the tag map.
         intrinsics: of the camera.
         options: how it works.
-        detector: finds the tags.
+        detector: finds the tags, of the map's family.
     """
 
     def __init__(
         self,
         tags: TagMap,
         intrinsics: Intrinsics,
-        options: TrackerOptions | None = None,
+        options: FollowerOptions | None = None,
         detector: Detector | None = None,
     ) -> None:
         self.tags = tags
         self.intrinsics = intrinsics
-        self.options = options or TrackerOptions()
+        self.options = options or FollowerOptions()
         self._limb_tags = {tag.id: tag for tag in tags.limb}
         self._flat = {tag.id: (tag.height, tag.size) for tag in tags.limb}
         self._flat.update({tag.id: (tag.position[2], tag.size) for tag in tags.world})
         self._world_positions = np.array([tag.position[:2] for tag in tags.world]).reshape(-1, 2)
         self._world_size = max((tag.size for tag in tags.world), default=1.0)
-        detector = detector or Detector(family=tags.family)
-        if detector.family != tags.family:
-            raise ValueError(
-                f"the detector reads {detector.family.name} but the tag map is of "
-                f"{tags.family.name}: make it by Detector(family=tag_map.family)"
-            )
-        self.tracker = TagTracker(self._flat, detector, self.options.full_search_period)
+        self.tracker = TagTracker(self._flat, detector or Detector(family=tags.family))
         self.world = WorldPose(tags, intrinsics)
         self.follower = LimbFollower(tags, self.options)
         self.size_error = 0.0
         """Share by which limb tags look larger or smaller than the tag map says, all alike."""
 
-    def observe(
-        self, gray: NDArray[np.uint8], stamp: float, search_later: bool = False
-    ) -> LimbObservation:
+    def observe(self, gray: NDArray[np.uint8], stamp: float) -> LimbObservation:
         """Find the limb in one image.
 
         Args:
             gray: image (rows, columns) of uint8.
             stamp: when it was taken [s].
-            search_later: leave what cannot change the answer to `search_again`.
 
         Raises:
             CameraError: the image has another size than the calibration.
@@ -117,7 +96,7 @@ class LimbTracker:
                 f"the image has {gray.shape[1]} x {gray.shape[0]} px but the calibration is for "
                 f"{size.width} x {size.height}: calibrate at the resolution that is used"
             )
-        found = self.tracker.track(gray, stamp, search_later)
+        found = self.tracker.track(gray, stamp)
         pose = self.world.update(found)
         if pose is None:
             placed = tuple(PlacedTag(tag, tag.id in self._limb_tags, None) for tag in found)
@@ -125,10 +104,6 @@ class LimbTracker:
         if not found:
             return LimbObservation((), *self.follower.follow([], stamp))
         return self._place(found, pose, stamp)
-
-    def search_again(self, gray: NDArray[np.uint8]) -> None:
-        """Look for duplicates and unknown tags in the last image, if that was left for later."""
-        self.tracker.search_again(gray)
 
     def _place(self, found: Sequence[Tag], pose: CameraPose, stamp: float) -> LimbObservation:
         """Place all tags on their planes, and follow the limb by its own."""
@@ -146,7 +121,7 @@ class LimbTracker:
             # Corners of a square that is too large are off by this share of half its diagonal.
             share = np.sqrt(2.0) * float(np.median(misfits[limb] / flat[limb, 1]))
             self.size_error += (share - self.size_error) / _SIZE_MEMORY
-        used = [i for i in limb if misfits[i] <= self.options.largest_misfit * flat[i, 1]]
+        used = [i for i in limb if misfits[i] <= _LARGEST_MISFIT * flat[i, 1]]
         planar = []
         for i in used:
             entry = self._limb_tags[found[i].id]
@@ -178,22 +153,3 @@ class LimbTracker:
         outward = (places[:, :2] - origin[:2]) / (heights - origin[2])[:, None]
         raised = uncertainty.height * np.column_stack([outward, np.zeros(len(places))])
         return np.concatenate([surveyed, raised[:, :, None]], axis=2)
-
-
-def warm_up(detector: Detector) -> None:
-    """Follow a tiny still limb through two images, so that no kernel is compiled in a run."""
-    family, f = detector.family, 500.0
-    side = 5 * family.border_cells
-    # 125 mm above the plane, a pixel is a quarter of a millimetre.
-    size = 0.00025 * side
-    limb, world = (LimbTag(0, 0.01, 0.0, size),), (WorldTag(1, (0.03, 0.0, 0.0), 0.0, size),)
-    tags = TagMap((0.02,), limb, world, family=family)
-    image = np.full((120, 240), 255, dtype=np.uint8)
-    for tag, left in ((0, 40), (1, 120)):
-        family.draw_tag(image, tag, 5, left, 40)
-    matrix = [f, 0.0, 59.5, 0.0, f, 59.5, 0.0, 0.0, 1.0]
-    tracker = LimbTracker(tags, Intrinsics.create(240, 120, matrix, []), detector=detector)
-    for stamp in (0.0, 0.03):
-        observation = tracker.observe(image, stamp)
-    if observation.estimate is None:
-        raise RuntimeError(f"the tracker does not work here: {observation.reason}")

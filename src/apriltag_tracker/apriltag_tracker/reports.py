@@ -111,8 +111,6 @@ class ImageWatch(StreamWatch):
         if tracker is not None:
             counts, world = tracker.tracker.counts, tracker.world
             values.update(
-                tags_tracked=counts.tracked,
-                tags_by_full_search=counts.by_full_search,
                 full_searches=counts.full_searches,
                 duplicates_rejected=counts.duplicates,
                 unknown_tags=dict(counts.unknown),

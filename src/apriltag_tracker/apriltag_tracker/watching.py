@@ -13,38 +13,6 @@ SILENCE = 2.0
 _CLOCKS_APART = 5.0
 """No state is this late or early [s] by one clock."""
 _WINDOW = 300
-_INTERVALS = 100
-"""So many tell the period of a stream."""
-_PAUSE = 5_000_000_000
-"""[ns] A longer gap is a source that paused."""
-
-
-class StampGaps:
-    """Counts what is missing between the stamps of a stream of nearly constant rate.
-
-    The period is the interval below which a tenth of the last ones lie: so even if most messages
-    are lost, the few neighbours that both arrive tell it. A gap of k periods is k − 1 missed
-    messages.
-    """
-
-    def __init__(self) -> None:
-        self._intervals: collections.deque[int] = collections.deque(maxlen=_INTERVALS)
-        self._newest = 0
-        self.missed = 0
-        """Messages that did not arrive between those that did."""
-
-    def take(self, stamp: int) -> None:
-        """Take the stamp [ns] of a message; zero means nothing, one that goes back begins anew."""
-        if stamp <= 0:
-            return
-        before, self._newest = self._newest, stamp
-        interval = stamp - before
-        if before == 0 or not 0 < interval <= _PAUSE:
-            return
-        self._intervals.append(interval)
-        if len(self._intervals) >= 2:
-            period = sorted(self._intervals)[len(self._intervals) // 10]
-            self.missed += round(interval / period) - 1
 
 
 class StreamWatch:
@@ -64,7 +32,6 @@ class StreamWatch:
         self.received = self.processed = self.failed = 0
         self.repeated = self.invalid = self.bridged = 0
         self._arrivals: collections.deque[float] = collections.deque(maxlen=_WINDOW)
-        self._gaps = StampGaps()
         self._stamp, self._again = -1, 0
         """The last stamp [ns], and how often it came again."""
         self._latency: collections.deque[float] = collections.deque(maxlen=_WINDOW)
@@ -73,7 +40,6 @@ class StreamWatch:
     def arrived(self, stamp: int) -> bool:
         """One came that has a stamp [ns], zero: none; tell whether the one before had another."""
         self.received += 1
-        self._gaps.take(stamp)
         self._arrivals.append(self._clock())
         self._again = self._again + 1 if stamp == self._stamp else 0
         self._stamp = stamp
@@ -112,7 +78,6 @@ class StreamWatch:
             f"{self._noun}s_received": self.received,
             f"{self._noun}s_processed": self.processed,
             f"{self._noun}s_failed": self.failed,
-            f"{self._noun}s_missed": self._gaps.missed,
             "repeated_stamps": self.repeated,
             "states_invalid": self.invalid,
             "states_bridged": self.bridged,

@@ -49,7 +49,7 @@ def test_part_choice_and_names(bag: Path):
     assert [entry[1:] for entry in played if entry[1]] == [
         ("/again", string(f"a{i}")) for i in range(5, 10)
     ]
-    assert {topic for _, topic, _ in play(bag, exclude=["/a"])} == {"", "/b"}
+    assert {topic for _, topic, _ in play(bag, topics=["/b"])} == {"", "/b"}
 
 
 @pytest.mark.parametrize(

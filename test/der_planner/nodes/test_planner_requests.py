@@ -21,8 +21,9 @@ LIMB = Limb.default()
 def options(limb=LIMB, **changes):
     """Return the parameters that requests are read with."""
     given = {
-        "payload": 0.0, "payload_at": 0.0, "learned_plans": "", "model": "der", "method": "",
-        "branch": "", "feedback": False, "limits": PathLimits(), "nearest_path": False,
+        "payload": 0.0, "payload_at": 0.0, "learned_plans": "", "default_model": "der",
+        "default_method": "", "branch": "", "feedback": False, "limits": PathLimits(),
+        "nearest_path": False,
     }  # fmt: skip
     return SimpleNamespace(limb=limb, **{**given, **changes})
 
@@ -64,7 +65,7 @@ def test_a_command_may_carry_a_path_with_a_load_of_its_own():
 def test_each_command_has_the_loads_of_its_time():
     """Those that it names, else those of the parameters."""
     limb = LIMB.mounted("hanging")
-    given = options(limb, payload=0.02, model="pcc")
+    given = options(limb, payload=0.02, default_model="pcc")
 
     def loaded(**fields) -> Limb:
         return from_command(MotionCommand(motion="asynchronous", **fields), given, 0).limb

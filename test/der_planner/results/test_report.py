@@ -19,8 +19,9 @@ from der_planner.results import (
     load_run,
     write_report,
 )
-from der_planner.results.overlay import RunImages, plot_shapes, write_video
+from der_planner.results.overlay import plot_shapes, write_video
 from der_planner.results.report import document
+from der_planner.results.scenes import RunImages
 
 
 @pytest.fixture(scope="module")

@@ -37,7 +37,6 @@ def test_paired_difference_and_interval():
     assert found.difference_m == pytest.approx(0.010)
     # Every resampled mean lies between the least and the largest difference.
     assert 0.0089 < found.low_m <= found.difference_m <= found.high_m < 0.0111
-    assert found.ratio == pytest.approx(22.0 / 12.0)
     assert compare([*DER, *PCC])[0] == found
 
 
@@ -70,8 +69,6 @@ def test_unpaired_trials_and_single_trials():
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        ({"period_s": 6.0}, "different period: 4 s, 6 s"),
-        ({"amplitude_rad": 0.5}, "different amplitude: 0.5 rad, 0.7 rad"),
         ({"problems": ("the driver reported a fault: x",)}, "fault"),
         ({"window_s": (1.0, 8.0)}, "different windows"),
         (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -54,7 +54,6 @@ class CameraCalibration:
         left_out: pictures that did not fit, or showed too little, with the reason.
         sigma: (4,) standard deviations of fx, fy, cx, cy [px].
         covered: share of the picture's area in which corners were seen, in twelfths.
-        remarks: what would make it better.
     """
 
     intrinsics: Intrinsics
@@ -63,7 +62,6 @@ class CameraCalibration:
     left_out: dict[str, str]
     sigma: Array
     covered: float
-    remarks: list[str] = field(default_factory=list)
 
 
 class BoardFinder:
@@ -130,7 +128,6 @@ def calibrate_camera(
             "degrees): focal length and distance cannot be told apart; tilt the board "
             "by 20 to 40 degrees"
         )
-    covered = _coverage(used, width, height)
     return CameraCalibration(
         intrinsics=Intrinsics.create(
             width, height, matrix, distortion, "rational_polynomial" if rational else "plumb_bob"
@@ -139,30 +136,8 @@ def calibrate_camera(
         pictures=len(used),
         left_out=left_out,
         sigma=sigma[:4],
-        covered=covered,
-        remarks=_remarks(covered, spread, rms),
+        covered=_coverage(used, width, height),
     )
-
-
-def _remarks(covered: float, spread: float, rms: float) -> list[str]:
-    """Say what would make a calibration better.
-
-    Args:
-        covered: share of the image that the board's corners covered.
-        spread: range of the board's tilts [degrees].
-        rms: error of its corners [px].
-    """
-    remarks = []
-    if covered < 0.9:
-        remarks.append(
-            f"corners cover {100 * covered:.0f} % of the image: distortion near the "
-            "edges is a guess"
-        )
-    if spread < 30.0:
-        remarks.append(f"the board was tilted by {spread:.0f} degrees only: 40 and more is better")
-    if rms > 0.3:
-        remarks.append(f"error of {rms:.2f} px: is the board flat, sharp, and printed to scale?")
-    return remarks
 
 
 def _solve(

@@ -149,8 +149,6 @@ def intrinsics(options: argparse.Namespace) -> None:
     )
     for name, why in result.left_out.items():
         print(f"left out: {name}: {why}")
-    for remark in result.remarks:
-        print(f"remark: {remark}")
     result.intrinsics.to_yaml(options.out)
     print(f"written to {options.out}")
 

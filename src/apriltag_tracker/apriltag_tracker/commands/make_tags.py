@@ -7,13 +7,11 @@ python3 scripts/make_tags.py board --paper letter --out sheets/
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import sys
 from pathlib import Path
 
 from ament_index_python.packages import get_package_share_directory
 
-from apriltag_tracker.family import FAMILIES
 from apriltag_tracker.sheets import (
     PAPERS,
     Page,
@@ -47,18 +45,13 @@ def main() -> int:
     common.add_argument("--out", type=Path, default=Path("sheets"), metavar="DIR")
     tags = what.add_parser("tags", parents=[common], help="every tag of a tag map")
     tags.add_argument("--tag-map", type=Path, default=DEFAULT_MAP, metavar="FILE")
-    tags.add_argument(
-        "--family", choices=sorted(FAMILIES), help="print this one and not that of the tag map"
-    )
     board = what.add_parser("board", parents=[common], help="a calibration board")
     add_board_arguments(board)
     options = parser.parse_args()
     try:
         if options.what == "tags":
-            tag_map = TagMap.from_yaml(options.tag_map)
-            if options.family is not None:
-                tag_map = dataclasses.replace(tag_map, family=FAMILIES[options.family])
-            _write(tag_pages(tag_map, options.paper), "tags", options)
+            pages = tag_pages(TagMap.from_yaml(options.tag_map), options.paper)
+            _write(pages, "tags", options)
         else:
             _write([board_page(given_board(options), options.paper)], "board", options)
     except (MapError, SheetError, OSError) as error:

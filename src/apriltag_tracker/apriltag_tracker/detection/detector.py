@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from apriltag_tracker.camera.images import check_grey
 from apriltag_tracker.detection.codes import code_table, nearest_tag, read_codes
 from apriltag_tracker.detection.edges import refine_quads
-from apriltag_tracker.family import Family, FamilyError, named
+from apriltag_tracker.family import TAG36H11, Family
 
 SMALLEST_TAG = 14.0
 """A shorter side is not looked for [px]; a cell of such a tag is 1.75 px wide."""
@@ -44,9 +44,6 @@ by this share of a cell for a misfit of one that is beyond `_SHARP_MISFIT`."""
 _LARGEST_RESIDUAL = 0.4
 """A candidate is dropped whose border's lines have a larger RMS residual than this [px]."""
 
-_CHECKED: set[str] = set()
-"""Families whose conventions have been checked in this process."""
-
 
 @dataclass(frozen=True)
 class Tag:
@@ -65,15 +62,6 @@ class Tag:
     line_residual: float
 
     @property
-    def centre(self) -> NDArray[np.float64]:
-        """Where the diagonals cross, (2,) px: the image of the printed tag's centre."""
-        a, b, c, d = self.corners
-        along, across, gap = c - a, d - b, b - a
-        determinant = along[0] * across[1] - along[1] * across[0]
-        share = (gap[0] * across[1] - gap[1] * across[0]) / determinant
-        return np.asarray(a + share * along)
-
-    @property
     def pixel_size(self) -> float:
         """Mean length of the sides [px]."""
         a, b, c, d = self.corners.tolist()
@@ -81,25 +69,8 @@ class Tag:
 
     def is_at(self, other: Tag) -> bool:
         """Tell whether another tag is at the same place of the image."""
-        return bool(np.hypot(*(self.centre - other.centre)) < 0.5 * other.pixel_size)
-
-
-class _Candidates(NamedTuple):
-    """Quadrilaterals of an image.
-
-    Attributes:
-        corners: (n, 4, 2) px.
-        covariances: (n, 8, 8) px², with what blended cells shift.
-        residuals: (n,) RMS distance of the crossings from the lines [px].
-        codes: (n,) of `read_codes`.
-        good: (n,) whether there is a straight border around clear cells that is no mirror image.
-    """
-
-    corners: NDArray[np.float64]
-    covariances: NDArray[np.float64]
-    residuals: NDArray[np.float64]
-    codes: NDArray[np.uint64]
-    good: NDArray[np.bool_]
+        apart = self.corners.mean(axis=0) - other.corners.mean(axis=0)
+        return bool(np.hypot(*apart) < 0.5 * other.pixel_size)
 
 
 class Detector:
@@ -112,34 +83,18 @@ class Detector:
             once in 790 000 at 1, once in 44 000 at 2; of tag25h9 once in 240 000 at 0; of tag16h5
             once in 550 at 0; of tagStandard41h12 once in 300 000 at 2; of tagStandard52h13 once in
             980 000 at 3, once in 78 000 at 4.
-        family: of the tags, or its name.
-
-    Raises:
-        ValueError: a tag smaller than can be read, or more forgiven cells than are safe.
-        FamilyError: this OpenCV answers otherwise than this package expects.
+        family: of the tags.
     """
 
     def __init__(
         self,
         smallest: float = SMALLEST_TAG,
         correct_bits: int | None = None,
-        family: Family | str = "tag36h11",
+        family: Family = TAG36H11,
     ) -> None:
-        if smallest < 8.0:
-            raise ValueError(f"smallest tag of {smallest} px: 8 px or more can be read")
-        self.family = named(family) if isinstance(family, str) else family
-        if correct_bits is None:
-            correct_bits = self.family.correct_bits
-        if not 0 <= correct_bits <= self.family.most_corrected:
-            raise ValueError(
-                f"correct_bits {correct_bits}: 0 to {self.family.most_corrected} with "
-                f"{self.family.name}; with more, pictures without a tag show some"
-            )
+        self.family = family
         self.smallest = smallest
-        self.correct_bits = correct_bits
-        if self.family.name not in _CHECKED:
-            self._check_conventions()
-            _CHECKED.add(self.family.name)
+        self.correct_bits = family.correct_bits if correct_bits is None else correct_bits
 
     def detect(self, gray: NDArray[np.uint8], thorough: bool = False) -> list[Tag]:
         """Find the tags of an image (rows, columns) of uint8; an id may be there more than once.
@@ -178,11 +133,11 @@ class Detector:
             ValueError: not such an image, or an empty one.
         """
         seen = self._candidates(self._read_as(gray), np.ascontiguousarray(corners))
-        wrong = np.bitwise_count(code_table(self.family)[0, list(ids)] ^ seen.codes)
-        good = seen.good & (wrong <= self.correct_bits + 1)
+        expected = code_table(self.family)[0]
         return [
-            Tag(ids[i], seen.corners[i], seen.covariances[i], float(seen.residuals[i]))
-            for i in np.flatnonzero(good).tolist()
+            replace(tag, id=ids[i])
+            for i, code, tag in seen
+            if np.bitwise_count(expected[ids[i]] ^ code) <= self.correct_bits + 1
         ]
 
     def _read_as(self, gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -192,22 +147,24 @@ class Detector:
 
     def _read(self, image: NDArray[np.uint8], quads: NDArray[np.float64]) -> list[Tag]:
         """Read the codes of quadrilaterals (n, 4, 2) px, in whatever direction."""
-        seen = self._candidates(image, quads)
         tags = []
-        for i in np.flatnonzero(seen.good).tolist():
-            tag, turn, wrong = nearest_tag(seen.codes[i], self.family)
+        for _, code, seen in self._candidates(image, quads):
+            tag, turn, wrong = nearest_tag(code, self.family)
             if wrong <= self.correct_bits:
                 order = (np.arange(4) + turn) % 4
                 both = np.stack([2 * order, 2 * order + 1], axis=1).ravel()
-                corners, covariance = (
-                    seen.corners[i][order],
-                    seen.covariances[i][np.ix_(both, both)],
-                )
-                tags.append(Tag(tag, corners, covariance, float(seen.residuals[i])))
+                covariance = seen.covariance[np.ix_(both, both)]
+                tags.append(Tag(tag, seen.corners[order], covariance, seen.line_residual))
         return tags
 
-    def _candidates(self, image: NDArray[np.uint8], quads: NDArray[np.float64]) -> _Candidates:
-        """Refine quadrilaterals (n, 4, 2) px and read their cells."""
+    def _candidates(
+        self, image: NDArray[np.uint8], quads: NDArray[np.float64]
+    ) -> Iterator[tuple[int, np.uint64, Tag]]:
+        """Refine quadrilaterals (n, 4, 2) px and read their cells.
+
+        Those are yielded that have a straight border around clear cells and are no mirror images:
+        with their place in ``quads``, their code, and as tags that have no id yet.
+        """
         corners, covariances, residuals, found = refine_quads(image, quads, _SEARCH)
         misfits, codes = read_codes(image, corners, self.family)
         along, across = corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1]
@@ -219,29 +176,8 @@ class Detector:
         cells = np.sqrt(0.5 * np.abs(turned)) / self.family.border_cells
         shifts = _BLENDED * np.maximum(misfits - _SHARP_MISFIT, 0.0) * cells
         covariances[good] += shifts[good, None, None] ** 2 * np.eye(8)
-        return _Candidates(corners, covariances, residuals, codes, good)
-
-    def _check_conventions(self) -> None:
-        """Detect one known tag; check id, corner order, rotation and pixel convention.
-
-        Raises:
-            FamilyError: this OpenCV answers otherwise than this package expects.
-        """
-        self.family.check_code_of_tag_0()
-        cells = self.family.border_cells
-        scale = max(5, math.ceil(1.2 * self.smallest / cells))
-        low, high = 4 * scale, (4 + cells) * scale
-        canvas = np.full((high + low, high + low), 255, dtype=np.uint8)
-        self.family.draw_tag(canvas, 0, scale, low, low)
-        expected = np.array([[low, high], [high, high], [high, low], [low, low]]) - 0.5
-        found = self.detect(canvas)
-        if [tag.id for tag in found] != [0] or np.abs(found[0].corners - expected).max() > 0.05:
-            seen = {tag.id: tag.corners.tolist() for tag in found}
-            raise FamilyError(
-                f"with OpenCV {cv2.__version__} the tags {seen} are found in a picture of tag 0 of "
-                f"{self.family.name} with corners {expected.tolist()}: its conventions changed; "
-                "install opencv-python-headless 4.14 or 5.0"
-            )
+        for i in np.flatnonzero(good).tolist():
+            yield i, codes[i], Tag(-1, corners[i], covariances[i], float(residuals[i]))
 
 
 def _is_dim(image: NDArray[np.uint8]) -> bool:

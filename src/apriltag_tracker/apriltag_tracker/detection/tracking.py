@@ -1,13 +1,13 @@
-"""Tags from frame to frame: short searches where tags are expected, full searches now and then.
+"""Tags from frame to frame: short searches where tags are expected, full searches for lost ones.
 
 A tag that was seen is looked for where the parabola through its last three pictures foresees it:
 lines are fitted to its border and its code is read there. When one is missing, the whole image is
-searched at once. While all tags are tracked, a full search runs once a second.
+searched at once, and later ten times a second.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -21,14 +21,8 @@ _ABSENT_PERIOD = 0.1
 _KEPT_FRAMES = 8
 """A tag that is missing for more frames than this is missing for long."""
 
-_LARGEST_JUMP = 1.5
-"""A duplicate that is further from the prediction than this is not the tag [sizes of a tag]."""
-
 _LONGEST_GAP = 1.0
 """After a longer time without images tracking starts anew [s]."""
-
-FULL_SEARCH_PERIOD = 1.0
-"""While all tags are tracked, the whole image is searched this often [s]."""
 
 
 @dataclass
@@ -36,8 +30,6 @@ class TrackingCounts:
     """How often what happened since the start."""
 
     full_searches: int = 0
-    tracked: int = 0
-    by_full_search: int = 0
     duplicates: int = 0
     unknown: dict[int, int] = field(default_factory=dict)
 
@@ -55,7 +47,6 @@ class Track:
         stamp: of that picture [s].
         velocity: (4, 2) px/s of the corners, since the picture before.
         acceleration: (4, 2) px/s², zero before it is known.
-        curved: whether the acceleration counts; not where the last picture was nearer without it.
         step: s from the picture before to the last one, 0 if there is none.
         missed: pictures since then in which the tag was not found.
     """
@@ -64,31 +55,23 @@ class Track:
     stamp: float
     velocity: NDArray[np.float64] = field(default_factory=_zero)
     acceleration: NDArray[np.float64] = field(default_factory=_zero)
-    curved: bool = True
     step: float = 0.0
     missed: int = 0
 
     def predict(self, stamp: float) -> NDArray[np.float64]:
         """Return the corners (4, 2) px at a time [s]: the parabola through the last pictures."""
         gap = stamp - self.stamp
-        corners = self.tag.corners + self.velocity * gap
-        return corners + self._bent(gap) if self.curved else corners
-
-    def _bent(self, gap: float) -> NDArray[np.float64]:
-        """Return by how much the parabola leaves the straight line after a time [s], (4, 2) px."""
-        return np.asarray(self.acceleration * (0.5 * gap * (gap + self.step)))
+        bent = self.acceleration * (0.5 * gap * (gap + self.step))
+        return self.tag.corners + self.velocity * gap + bent
 
     def follow(self, tag: Tag, stamp: float) -> Track:
         """Return the track with one more picture of the tag."""
         step = stamp - self.stamp
-        moved = tag.corners - self.tag.corners
-        velocity = moved / step
-        off = moved - self.velocity * step
-        straight, bent = (float(np.abs(gap).max()) for gap in (off, off - self._bent(step)))
+        velocity = (tag.corners - self.tag.corners) / step
         acceleration = _zero()
         if self.step > 0.0 and self.missed == 0:
             acceleration = (velocity - self.velocity) * (2.0 / (step + self.step))
-        return Track(tag, stamp, velocity, acceleration, bent <= straight, step)
+        return Track(tag, stamp, velocity, acceleration, step)
 
 
 class TagTracker:
@@ -97,101 +80,59 @@ class TagTracker:
     Args:
         wanted: ids of the tags in the map; others are counted and left out.
         detector: finds and confirms tags.
-        full_search_period: s between full searches while all tags are tracked; 0 searches every
-            image in full.
     """
 
-    def __init__(
-        self,
-        wanted: Collection[int],
-        detector: Detector,
-        full_search_period: float = FULL_SEARCH_PERIOD,
-    ) -> None:
+    def __init__(self, wanted: Collection[int], detector: Detector) -> None:
         self._wanted = frozenset(wanted)
         self._detector = detector
-        self._full_search_period = full_search_period
         self.counts = TrackingCounts()
         self._tracks: dict[int, Track] = {}
-        self._postponed: dict[int, Tag] | None = None
-        """What was found in the last image, if its full search was left for later."""
-        self._last_full = self._last_thorough = -np.inf
+        self._last_thorough = -np.inf
 
-    def track(self, gray: NDArray[np.uint8], stamp: float, search_later: bool = False) -> list[Tag]:
+    def track(self, gray: NDArray[np.uint8], stamp: float) -> list[Tag]:
         """Find the tags of one frame.
 
         Args:
             gray: image (rows, columns) of uint8.
             stamp: when it was taken [s]; must grow from call to call, or tracking starts anew.
-            search_later: leave a search of the whole image that can add nothing to this answer to
-                `search_again`, for those who wait for the answer.
 
         Returns:
             Tags of the map, each id once.
         """
-        self._postponed = None
         if any(not 0.0 < stamp - track.stamp <= _LONGEST_GAP for track in self._tracks.values()):
             self._tracks.clear()
-            self._last_full = self._last_thorough = -np.inf
-        predicted = {tag: track.predict(stamp) for tag, track in self._tracks.items()}
+            self._last_thorough = -np.inf
         fresh = [tag for tag, track in self._tracks.items() if track.missed == 0]
         found: dict[int, Tag] = {}
         if fresh:
-            corners = np.array([predicted[tag] for tag in fresh])
+            corners = np.array([self._tracks[tag].predict(stamp) for tag in fresh])
             found = {tag.id: tag for tag in self._detector.confirm(gray, fresh, corners)}
-        self.counts.tracked += len(found)
-        self._search_in_full(gray, stamp, found, predicted, search_later)
+        self._search_in_full(gray, stamp, found)
         self._remember(found, stamp)
         return [found[tag] for tag in sorted(found)]
 
-    def search_again(self, gray: NDArray[np.uint8]) -> None:
-        """Search the whole of the last image for duplicates and unknown tags, if that was left."""
-        if self._postponed is not None:
-            self.counts.full_searches += 1
-            self._merge(self._postponed, self._detector.detect(gray), {})
-            self._postponed = None
+    def _search_in_full(self, gray: NDArray[np.uint8], stamp: float, found: dict[int, Tag]) -> None:
+        """Add tags of the whole image, but for those that are there twice, if it is time to search.
 
-    def _search_in_full(
-        self,
-        gray: NDArray[np.uint8],
-        stamp: float,
-        found: dict[int, Tag],
-        predicted: dict[int, NDArray[np.float64]],
-        search_later: bool,
-    ) -> None:
-        """Search the whole image if it is time to: at once for a tag that was just lost."""
-        absent = bool(self._wanted - found.keys() - predicted.keys())
-        thorough = absent and stamp - self._last_thorough >= _ABSENT_PERIOD
-        missing = any(tag not in found for tag in predicted)
-        due = stamp - self._last_full >= self._full_search_period
-        if not (thorough or missing or due):
-            return
-        self._last_full = stamp
-        if search_later and not missing and not absent:
-            self._postponed = found
+        It is for a tag that was just lost, and now and then for one that has been missing for long.
+        """
+        absent = self._wanted - found.keys() - self._tracks.keys()
+        thorough = bool(absent) and stamp - self._last_thorough >= _ABSENT_PERIOD
+        if not thorough and self._tracks.keys() <= found.keys():
             return
         if thorough:
             self._last_thorough = stamp
         self.counts.full_searches += 1
-        self._merge(found, self._detector.detect(gray, thorough), predicted)
-
-    def _merge(
-        self, found: dict[int, Tag], more: Sequence[Tag], predicted: dict[int, NDArray[np.float64]]
-    ) -> None:
-        """Add tags of a search to those already found; take duplicates and impossible jumps out."""
         by_id: dict[int, list[Tag]] = {}
-        for tag in more:
+        for tag in self._detector.detect(gray, thorough):
             if tag.id in self._wanted:
                 by_id.setdefault(tag.id, []).append(tag)
             else:
                 self.counts.unknown[tag.id] = self.counts.unknown.get(tag.id, 0) + 1
         for tag_id, places in by_id.items():
             self.counts.duplicates += len(places) > 1
-            if tag_id in found:
-                continue
-            near = _near(places, predicted.get(tag_id)) if len(places) > 1 else places
-            if len(near) == 1:
-                found[tag_id] = near[0]
-                self.counts.by_full_search += 1
+            if tag_id not in found and len(places) == 1:
+                found[tag_id] = places[0]
 
     def _remember(self, found: dict[int, Tag], stamp: float) -> None:
         for tag_id, tag in found.items():
@@ -202,15 +143,3 @@ class TagTracker:
             track.missed += 1
             if track.missed > _KEPT_FRAMES:
                 del self._tracks[tag_id]
-
-
-def _near(tags: Sequence[Tag], predicted: NDArray[np.float64] | None) -> list[Tag]:
-    """Return those of several tags with one id that are where it was expected."""
-    if predicted is None:
-        return []
-    middle = predicted.mean(axis=0)
-    return [
-        tag
-        for tag in tags
-        if np.hypot(*(tag.corners.mean(axis=0) - middle)) < _LARGEST_JUMP * tag.pixel_size
-    ]

@@ -12,7 +12,7 @@ import math
 import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from ament_index_python.packages import get_package_share_directory
@@ -35,7 +35,6 @@ CLAMP_FRAME = "limb_clamp"
 TIP_FRAME = "limb_tip"
 """Name of the frame at the tip, x along the limb."""
 _MARKER_PERIOD = 0.1
-_Options = TypeVar("_Options", bound=FollowerOptions)
 
 
 class LimbStateNode(Node):
@@ -59,7 +58,7 @@ class LimbStateNode(Node):
         self._noun = noun
         self._last_markers = 0.0
 
-    def declare_following(self, usual: _Options) -> _Options:
+    def declare_following(self, usual: FollowerOptions) -> FollowerOptions:
         """Declare how the limb is followed; ``usual`` are the defaults."""
         noun, sigma, number = self._noun, usual.uncertainty, functools.partial(declare, self)
         missing = f"frames without limb {noun} that are bridged and marked"

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -205,23 +204,6 @@ def planar_poses(
     return np.column_stack([centres, np.arctan2(sine, cosine)]), slopes, misfits
 
 
-class Located(NamedTuple):
-    """Where n tags are on their planes.
-
-    Attributes:
-        places: (n, 3) x, y [m], yaw [rad].
-        spreads: (n, 3, 3) their covariances from the noise of the corners.
-        misfits: (n,) RMS distance of the corners from a square of the tag's size [m].
-        moves: (n, 3, 6) derivatives of the places, while the pixels stay, by a turn [rad] and a
-            shift [m] of the camera's frame.
-    """
-
-    places: NDArray[np.float64]
-    spreads: NDArray[np.float64]
-    misfits: NDArray[np.float64]
-    moves: NDArray[np.float64]
-
-
 def locate(
     corners: NDArray[np.float64],
     covariances: NDArray[np.float64],
@@ -229,7 +211,7 @@ def locate(
     sizes: NDArray[np.float64],
     intrinsics: Intrinsics,
     pose: CameraPose,
-) -> Located:
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Place tags that lie flat at known heights.
 
     A point X of the camera's frame that turns by ω and shifts by τ goes to X + ω × X + τ; what the
@@ -242,6 +224,12 @@ def locate(
         sizes: (n,) m, edges of the black borders.
         intrinsics: of the camera.
         pose: of the camera.
+
+    Returns:
+        Places (n, 3): x, y [m], yaw [rad]; their covariances (n, 3, 3) from the noise of the
+        corners; the RMS distance (n,) of the corners from a square of the tag's size [m]; and the
+        derivatives (n, 3, 6) of the places, while the pixels stay, by a turn [rad] and a shift [m]
+        of the camera's frame.
     """
     rotation, origin = pose.rotation, pose.position
     rays = intrinsics.rays(corners.reshape(-1, 2)).reshape(-1, 4, 2)
@@ -262,4 +250,4 @@ def locate(
     turned = shifts @ rotation
     moves = (across / down)[:, :, None] * turned[..., 2:] - turned[..., :2]
     moves = np.einsum("npkr,nkmr->npm", by_corner, moves)
-    return Located(places, gain @ covariances @ gain.transpose(0, 2, 1), misfits, moves)
+    return places, gain @ covariances @ gain.transpose(0, 2, 1), misfits, moves

@@ -151,40 +151,23 @@ class SyntheticCamera:
         self._darker = np.maximum(-self._noise, 0).astype(np.uint8)
         self._mounts = self._draw_mounts()
         self._background, self._world = self._make_background(self._draw_world())
-        self._prepared: NDArray[np.uint8] | None = None
         self._noise_starts = np.zeros(len(tags.limb), dtype=np.int64)
 
-    def prepare(self, into: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
-        """Draw what the next picture shows whatever the limb does, with that picture's noise.
-
-        A camera that is waiting for the limb does this ahead; `frame` does it otherwise.
-
-        Args:
-            into: (rows, columns) to draw into; new memory if it is None.
-
-        Returns:
-            What the next picture will be drawn into.
-        """
-        rows, columns = self._background.shape
-        start = int(self._random.integers(0, _NOISE_LENGTH - rows * columns))
-        self._noise_starts = self._random.integers(0, _NOISE_LENGTH, len(self._noise_starts))
-        noise = np.s_[start : start + rows * columns]
-        image = np.empty((rows, columns), dtype=np.uint8) if into is None else into
-        cv2.add(self._background, self._brighter[noise].reshape(rows, columns), image)
-        cv2.subtract(image, self._darker[noise].reshape(rows, columns), image)
-        self._prepared = image
-        return image
-
     def frame(self, shape: Shape | None, velocity: Shape | None = None) -> RenderedPicture:
-        """Render one picture, into what was prepared for it.
+        """Render one picture.
 
         Args:
             shape: the limb at mid-exposure; None leaves it out.
             velocity: the shape one second later at the present velocity minus the shape itself, in
                 the same arrays; blurs what moves.
         """
-        image = self.prepare() if self._prepared is None else self._prepared
-        self._prepared = None
+        rows, columns = self._background.shape
+        start = int(self._random.integers(0, _NOISE_LENGTH - rows * columns))
+        self._noise_starts = self._random.integers(0, _NOISE_LENGTH, len(self._noise_starts))
+        noise = np.s_[start : start + rows * columns]
+        image = np.empty((rows, columns), dtype=np.uint8)
+        cv2.add(self._background, self._brighter[noise].reshape(rows, columns), image)
+        cv2.subtract(image, self._darker[noise].reshape(rows, columns), image)
         result = RenderedPicture(image, dict(self._world))
         if shape is not None:
             self._draw_body(image, shape)

@@ -27,17 +27,11 @@ class MocapFaults:
         position_noise: standard deviation of a coordinate [m].
         direction_noise: standard deviation of a turn about each axis [rad].
         dropout: share of frames in which a body is lost, each for itself.
-        swapped: names of two bodies that have each other's names; empty: none.
-        swapped_from: when this begins, since the first frame [s].
-        delay: by which stamps are late [s].
     """
 
     position_noise: float = 0.0
     direction_noise: float = 0.0
     dropout: float = 0.0
-    swapped: tuple[str, ...] = ()
-    swapped_from: float = 0.0
-    delay: float = 0.0
 
 
 class SyntheticMocap:
@@ -49,9 +43,6 @@ class SyntheticMocap:
         tilt: of the plane of motion against the floor [rad].
         seed: of noise and dropouts.
         up: axis of the poses' frame that points up, of `UPRIGHT`.
-
-    Raises:
-        ValueError: a body that is to be swapped is not in the map.
     """
 
     def __init__(
@@ -63,9 +54,6 @@ class SyntheticMocap:
         up: str = "z",
     ) -> None:
         self.bodies, self.faults = bodies, faults or MocapFaults()
-        for name in self.faults.swapped:
-            if name not in bodies.names:
-                raise ValueError(f"no body '{name}' to swap: there are {', '.join(bodies.names)}")
         self._random = np.random.default_rng(seed)
         level = Rotation.from_rotvec(np.array(UPRIGHT[up]))
         # limb_base in the frame of the poses
@@ -74,12 +62,9 @@ class SyntheticMocap:
         ).as_matrix()
         self.origin = np.array([0.4, -0.2, 0.9])
         """Where the clamp is in the frame of the poses [m]."""
-        self._started: int | None = None
 
     def frame(self, stamp: int, shape: Shape) -> PoseFrame:
         """Return the poses of all bodies at an instant [ns] in which the limb has a shape."""
-        if self._started is None:
-            self._started = stamp
         faults, bodies = self.faults, self.bodies
         count = len(bodies.names)
         positions, axes = np.empty((count, 3)), np.empty((count, 3, 3))
@@ -101,8 +86,4 @@ class SyntheticMocap:
         quaternions = np.asarray(turns.as_quat(), dtype=np.float64)
         lost = self._random.random(count) < faults.dropout
         positions[lost] = np.nan
-        since = (stamp - self._started) * 1e-9
-        if faults.swapped and since >= faults.swapped_from:
-            pair = [bodies.names.index(name) for name in faults.swapped]
-            positions[pair], quaternions[pair] = positions[pair[::-1]], quaternions[pair[::-1]]
-        return PoseFrame(stamp + round(1e9 * faults.delay), positions / bodies.unit, quaternions)
+        return PoseFrame(stamp, positions / bodies.unit, quaternions)

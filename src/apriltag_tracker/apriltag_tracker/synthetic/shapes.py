@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import CubicHermiteSpline
 
 PLACEMENT = 5
 """Numbers of a placed tag: x, y, z [m], yaw [rad], size [m]."""
@@ -30,15 +31,12 @@ class Shape:
         """Return x, y, heading (…, 3) at arc lengths (…) (cubic), continued as a line beyond."""
         nodes = self.arc_length
         inside = np.clip(arc_length, nodes[0], nodes[-1])
-        k = np.clip(np.searchsorted(nodes, inside) - 1, 0, len(nodes) - 2)
-        t = ((inside - nodes[k]) / (nodes[k + 1] - nodes[k]))[..., None]
-        # Hermite: the tangents are known, their length is that of the chord's arc.
-        chord, turned = self.points[k + 1] - self.points[k], self.heading[k + 1] - self.heading[k]
-        arc = (np.hypot(*np.moveaxis(chord, -1, 0)) * (1.0 + 0.25 * turned**2 / 6.0))[..., None]
-        heading = self.heading[k] + t[..., 0] * turned
-        place = self.points[k] + (3.0 * t**2 - 2.0 * t**3) * chord
-        place += arc * (t - 2.0 * t**2 + t**3) * _tangent(self.heading[k])
-        place += arc * (t**3 - t**2) * _tangent(self.heading[k + 1])
+        # The limb may be stretched: each chord is that of an arc.
+        chords, turned = np.hypot(*np.diff(self.points, axis=0).T), np.diff(self.heading)
+        along = np.append(0.0, np.cumsum(chords * (1.0 + turned**2 / 24.0)))
+        curve = CubicHermiteSpline(along, self.points, _tangent(self.heading))
+        heading = np.interp(inside, nodes, self.heading)
+        place = curve(np.interp(inside, nodes, along))
         place += (np.asarray(arc_length) - inside)[..., None] * _tangent(heading)
         return np.concatenate([place, heading[..., None]], axis=-1)
 

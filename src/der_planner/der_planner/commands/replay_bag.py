@@ -63,14 +63,12 @@ class Selection:
         start: seconds after the bag's first message at which to begin.
         stop: seconds after it at which to end; None = the bag's end.
         topics: only these recorded names; all if empty.
-        exclude: recorded names to leave out.
         remap: recorded name to the name to publish on.
     """
 
     start: float = 0.0
     stop: float | None = None
     topics: Sequence[str] = ()
-    exclude: Sequence[str] = ()
     remap: Mapping[str, str] = field(default_factory=dict)
 
     def window(self, bag: BagReader) -> tuple[int, int]:
@@ -97,13 +95,11 @@ def choose_topics(bag: BagReader, wanted: Selection) -> dict[str, RecordedTopic]
         BagError: a name that is asked for or remapped is not in the bag, or two share a name.
     """
     known = bag.topics
-    for name in (*wanted.topics, *wanted.exclude, *wanted.remap):
+    for name in (*wanted.topics, *wanted.remap):
         if name not in known:
             raise BagError(f"{bag.path} has no topic {name}, only {', '.join(sorted(known))}")
     chosen: dict[str, RecordedTopic] = {}
     for name in wanted.topics or known:
-        if name in wanted.exclude:
-            continue
         target = wanted.remap.get(name, name)
         if target in chosen:
             raise BagError(f"{chosen[target].name} and {name} would both be played on {target}")
@@ -241,7 +237,6 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--from", dest="start", type=float, default=0.0, metavar="S")
     parser.add_argument("--to", dest="stop", type=float, default=None, metavar="S")
     parser.add_argument("--topics", nargs="+", default=[], metavar="TOPIC", help="only these")
-    parser.add_argument("--exclude", nargs="+", default=[], metavar="TOPIC")
     parser.add_argument("--remap", nargs="+", default=[], metavar="OLD=NEW")
     parser.add_argument("--step-by", default="", metavar="TOPIC=ANSWER", help="wait for answers")
     parser.add_argument(
@@ -260,9 +255,7 @@ def _pairs(values: list[str], what: str) -> dict[str, str]:
 def _replay(given: argparse.Namespace) -> int:
     if given.rate < 0:
         raise OptionError(f"--rate is {given.rate}: choose 0 or more")
-    wanted = Selection(
-        given.start, given.stop, given.topics, given.exclude, _pairs(given.remap, "--remap")
-    )
+    wanted = Selection(given.start, given.stop, given.topics, _pairs(given.remap, "--remap"))
     stepping = _pairs([given.step_by] if given.step_by else [], "--step-by")
     step_by, answer = next(iter(stepping.items()), ("", ""))
     progress, count = Progress(), 0

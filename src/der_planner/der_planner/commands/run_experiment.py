@@ -6,7 +6,6 @@
     python3 scripts/run_experiment.py --hardware my_rig.yaml --limb my_limb.yaml
 
 Sets up what is missing first (ROS 2, Python packages, the nodes); --help shows every option.
-
 Who plays differs: the nodes of the graph, which leave a bag, or this process, which leaves arrays.
 Everything else is one path.
 """
@@ -291,11 +290,9 @@ def _limb_file(trial: Trial, options: Options, progress: Progress) -> Path | Non
     prior = Limb.default().loaded(Load(mounting=options.load.mounting))
     if said := nearly_buckling(prior):
         progress.say(f"  warning: with the stiffness and mass of the default limb {said}")
-    progress.say(f"  calibrating on the twin of seed {trial.seed}")
-    begin = time.monotonic()
+    progress.say(f"  calibrating on the twin of seed {trial.seed}: {path}")
     limb, _ = calibrate_twin(trial.seed, prior)
     limb.to_yaml(path)
-    progress.say(f"  calibrated in {time.monotonic() - begin:.1f} s: {path}")
     return path
 
 
@@ -313,27 +310,16 @@ def _describe(
     options: Options, trials: list[Trial], left: list[Trial], limb: Limb, progress: Progress
 ) -> None:
     """Say what would be done."""
-    progress.say(f"limb: {limb.name}, {limb.segment_count} segments, {limb.length:.3f} m")
-    progress.say(f"loads: {_loads(limb)}")
+    size = f"{limb.segment_count} segments, {limb.length:.3f} m"
+    progress.say(f"limb: {limb.name}, {size}, {_loads(limb)}")
     progress.say(f"stage: {_stage(options)}")
-    if (in_the_way := options.in_the_way) is not None:
-        later = ", looked at once the limb is calibrated" if options.calibrate else ""
-        progress.say(f"in the way: {', '.join(map(str, in_the_way.items))}{later}")
-    if options.feedback:
-        limit = f", up to {options.force_limit} N" if options.force_limit else ""
-        progress.say(f"what touches the limb under feedback: {options.reaction}{limit}")
-    if options.hardware is not None:
-        for name, values in vars(options.hardware).items():
-            progress.say(f"  {name}: {values or 'as it is'}")
     progress.say(f"into: {options.out}")
     for trial in trials:
         state = "to play" if trial in left else "done"
         progress.say(f"  {trial.name}  seed {trial.seed}  {state}")
-    each = f"of {options.period * options.cycles:.0f} s motion each"
-    where = each if options.path is None else f"along {options.path}"
-    if options.path is not None and options.calibrate:
-        where += ", whose reach is looked at once the limb is calibrated"
-    progress.say(f"{len(left)} trials {where}; nothing was started")
+    if options.calibrate:
+        progress.say("what is in reach and free of obstacles is known once the limb is calibrated")
+    progress.say(f"{len(left)} trials; nothing was started")
 
 
 def _loads(limb: Limb) -> str:

@@ -170,19 +170,6 @@ def _try_folder(path: Path, named: str) -> None:
         raise OptionError(f"{named} cannot be written: {error.strerror} in {present}") from error
 
 
-def folder_argument(text: str) -> Path:
-    """Return a folder of the command line that can be written; for the ``type`` of argparse.
-
-    Raises:
-        argparse.ArgumentTypeError: it cannot.
-    """
-    try:
-        check_folder(Path(text), "the folder")
-    except OptionError as error:
-        raise argparse.ArgumentTypeError(str(error)) from error
-    return Path(text)
-
-
 # Loads -------------------------------------------------------------------------------------------
 
 

@@ -8,6 +8,7 @@ import dataclasses
 import json
 import os
 import secrets
+import shutil
 import signal
 import socket
 import subprocess
@@ -18,6 +19,7 @@ from typing import Any
 
 import yaml
 
+from der_planner.bags.topics import installed_prefixes
 from der_planner.experiment.console import OptionError
 from der_planner.files import read_yaml
 from der_planner.limb import Limb
@@ -218,9 +220,8 @@ class GraphSetup:
         board = {"port_link": port, "seed": self.seed, **language}
         twin = {"seed": self.seed, "run": self.run, **_twin_loads(self.limb)}
         driver = {"port": port, **(language if rig.twin is not None else {}), **rig.driver}
-        wired = {}
-        if wiring := driver.get("wiring"):
-            wired = {"wiring": order_of(wiring, 2 * driver.get("segment_count", 2))}
+        wiring, valves = driver.get("wiring"), 2 * driver.get("segment_count", 2)
+        wired = {"wiring": order_of(wiring, valves)} if wiring else {}
         recorder = {
             "output": str(self.bag),
             "metadata": json.dumps(self.metadata | wired),
@@ -293,14 +294,14 @@ def find_executable(package: str, executable: str) -> Path:
     Raises:
         NodeError: no prefix of AMENT_PREFIX_PATH has it.
     """
-    for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep):
-        candidate = Path(prefix) / "lib" / package / executable
-        if prefix and os.access(candidate, os.X_OK):
-            return candidate
-    raise NodeError(
-        f"no executable '{executable}' in package '{package}': build the workspace with "
-        "python3 scripts/workspace.py setup"
-    )
+    folders = (str(prefix / "lib" / package) for prefix in installed_prefixes())
+    found = shutil.which(executable, path=os.pathsep.join(folders))
+    if found is None:
+        raise NodeError(
+            f"no executable '{executable}' in package '{package}': build the workspace with "
+            "python3 scripts/workspace.py setup"
+        )
+    return Path(found)
 
 
 def _die_with_parent() -> None:
@@ -370,16 +371,11 @@ class NodeProcess:
         """Whether the process runs."""
         return self.exit_code is None
 
-    def measure_cpu(self) -> float:
-        """Return the user and system time [s] that the process, which runs, has used so far."""
-        fields = Path(f"/proc/{self.pid}/stat").read_text().rsplit(")", 1)[1].split()
-        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-
-    def last_words(self, lines: int = 6) -> str:
+    def last_words(self) -> str:
         """Return the end of the log, preferring what the node called an error."""
         text = self.log.read_text(errors="replace").splitlines()
         complaints = [line for line in text if line.startswith("error:")]
-        return "\n".join(complaints[-lines:] or text[-lines:])
+        return "\n".join((complaints or text)[-6:])
 
     def failure(self, what: str) -> NodeError:
         """Return the error that says what became of the process, e.g. that it "died"."""

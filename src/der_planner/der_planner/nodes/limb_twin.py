@@ -37,17 +37,12 @@ class LimbTwinNode(Node):
         read: Any = functools.partial(parameters.declare, self)
         seed = read("seed", 0, "draws the hardware of this trial", at_least=0)
         run = read("run", 0, "draws how the rest angles wander in this run", at_least=0)
-        rate = read(
-            "rate", 30.0, "shapes published per second [Hz]", at_least=1.0, at_most=120.0
-        )  # fmt: skip
+        rate = read("rate", 30.0, "shapes published per second [Hz]", 1.0, 120.0)
         self._twin = self._mount(seed, run, read)
-        read(
-            "gain", 1.0, "of the chambers' moments, 1: as drawn; may be set at run time",
-            at_least=0.0, at_most=2.0, read_only=False,
-        )  # fmt: skip
-        wiring = read(
-            "wiring", [1, 2, 3, 4], "chamber of each valve; minus: it bends the other way"
-        )
+        moments = "of the chambers' moments, 1: as drawn; may be set at run time"
+        read("gain", 1.0, moments, 0.0, 2.0, read_only=False)
+        hoses = "chamber of each valve; minus: it bends the other way"
+        wiring = read("wiring", [1, 2, 3, 4], hoses)
         self._wiring = Wiring(tuple(map(int, wiring)))
         check_overrides(self)
         self._lock = threading.Lock()
@@ -75,9 +70,7 @@ class LimbTwinNode(Node):
         """
         gravity = read("gravity", [0.0, 0.0, 0.0], "acceleration in limb_base: x, y, z [m/s^2]")
         masses = read("masses", [0.0], "that the limb carries [kg]")
-        places = read(
-            "masses_at", [0.0], "where each mass sits, from the clamp along the limb [m]"
-        )  # fmt: skip
+        places = read("masses_at", [0.0], "where each mass sits, along the limb from its clamp [m]")
         if len(gravity) != 3:
             raise TwinError(f"parameter 'gravity' must be three numbers in m/s², got {gravity}")
         if len(masses) != len(places):
@@ -88,9 +81,8 @@ class LimbTwinNode(Node):
         x, y, z = map(float, gravity)
         both = zip(masses, places, strict=True)
         carried = [PointMass(float(at), float(mass)) for mass, at in both]
-        pegs = read(
-            "pegs", [0.0], "round things in the limb's way: x, y, radius of each [m]; 0: nothing"
-        )  # fmt: skip
+        round_things = "round things in the limb's way: x, y, radius of each [m]; 0: nothing"
+        pegs = read("pegs", [0.0], round_things)
         twin = LimbTwin(seed, run, gravity=(x, y, z), masses=carried)
         if any(pegs):
             if len(pegs) % 3:

@@ -66,8 +66,7 @@ class PlannerNode(Node):
         self._action = MotionAction(
             self, self._checked, self._accept, self._stop_plan, self._streamer.find
         )
-        self._planning = threading.Thread(target=self._run, name="planning", daemon=True)
-        self._planning.start()
+        threading.Thread(target=self._run, name="planning", daemon=True).start()
         self.create_subscription(PressureState, topics.PRESSURE_STATE, self._on_driver, qos.STATES)
         self.create_subscription(LimbState, topics.LIMB_STATE, self._on_limb, qos.STATES)
         self.create_subscription(MotionCommand, topics.COMMAND, self._on_command, qos.COMMANDS)
@@ -92,8 +91,7 @@ class PlannerNode(Node):
         self._action.compare(message)
 
     def _on_command(self, message: MotionCommand) -> None:
-        request = self._checked(message)
-        if request is not None:
+        if (request := self._checked(message)) is not None:
             self._accept(request)
 
     def _checked(self, message: MotionCommand) -> Request | None:
@@ -145,12 +143,10 @@ class PlannerNode(Node):
         else:
             plan_id, result, corrected = newest
             feedback = self._options.corrected(result) if corrected else None
-            schedule = self._play(self._streamer.unspent(plan_id), result, 0, feedback)
+            name = self._streamer.unspent(plan_id)
+            self._play(name, result, 0, feedback)
             response.success = True
-            response.message = (
-                f"plays plan {schedule.plan_id} ({result.motion}) for {result.duration:.0f} s, "
-                f"beginning in {max(self._seconds_until(schedule.start), 0.0):.1f} s"
-            )
+            response.message = f"plays plan {name} ({result.motion}) for {result.duration:.0f} s"
         return response
 
     def _on_stop(self, _: Any, response: Any) -> Any:
@@ -289,7 +285,7 @@ class PlannerNode(Node):
                 result = plan(
                     request.limb, request.motion, request.model, request.method,
                     nodes=self._options.nodes, start=start, progress=progress,
-                    obstacles=self._options.obstacles,
+                    obstacles=self._options.in_the_way,
                 )  # fmt: skip
             elif start is not None:
                 raise ValueError("a learned plan begins at rest: send it after this motion")
@@ -309,7 +305,7 @@ class PlannerNode(Node):
         start: int,
         feedback: Feedback | None,
         cancelled: threading.Event | None = None,
-    ) -> Schedule:
+    ) -> None:
         with self._streamer.lock:
             if cancelled is not None and cancelled.is_set():
                 raise Cancelled
@@ -321,9 +317,8 @@ class PlannerNode(Node):
             self._output.plan(schedule)
         self.get_logger().info(
             f"plan {plan_id} planned in {result.solve_time:.2f} s: {schedule.count} setpoints over "
-            f"{result.duration:.1f} s, the first in {self._seconds_until(schedule.start):.2f} s"
+            f"{result.duration:.1f} s"
         )
-        return schedule
 
     def _send(self, schedule: Schedule, index: int) -> None:
         """Publish one setpoint and where the tip should be at its instant."""
@@ -364,9 +359,6 @@ class PlannerNode(Node):
 
     def _now(self) -> int:
         return int(self.get_clock().now().nanoseconds)
-
-    def _seconds_until(self, instant: int) -> float:
-        return (instant - self._now()) / NANOSECONDS
 
     # What it says of itself ----------------------------------------------------------------
 

@@ -1,9 +1,10 @@
 """What is asked of the planner: its parameters, the messages that ask for a motion, its action."""
 
+# ruff: noqa: RUF009 - `_parameter` returns a field
+
 from __future__ import annotations
 
 import dataclasses
-import functools
 import math
 import threading
 import uuid
@@ -40,31 +41,70 @@ FURTHEST_STAMP = 600
 """A start that lies further ahead than this [s] is a mistake: another clock, or another epoch."""
 
 
+def _parameter(
+    default: Any, text: str, least: float | None = None, most: float | None = None, **more: Any
+) -> Any:
+    """Return the field of a parameter of the same name, with what `declare` is told of it."""
+    return field(default=default, metadata={"told": (text, least, most), **more})
+
+
 @dataclass(frozen=True)
 class PlannerOptions:
-    """The node's parameters, checked; times in ns where they meet stamps, else in s.
+    """The node's parameters, checked: each field with a description, and what follows from others.
 
-    `limb` is mounted as the parameters say, and does not carry the payload yet.
+    `limb` is mounted as the parameters say, and does not carry the payload yet; `lead` is the lead
+    time in ns; `limits` are those along a path; `in_the_way` is what the file of obstacles holds.
     """
 
     limb: Limb
-    limb_file: str
-    payload: float
-    payload_at: float
-    model: str
-    method: str
-    nodes: int
     lead: int
-    auto_start: bool
-    branch: str
     limits: PathLimits
-    nearest_path: bool
-    driver_timeout: float
-    learned_plans: str
-    feedback: bool
-    reaction: Kind
-    force_limit: float
-    obstacles: Obstacles | None
+    in_the_way: Obstacles | None
+    limb_file: str = _parameter("", "limb file (YAML); empty: the default limb")
+    mounting: str = _parameter(
+        "", "horizontal, hanging, standing, sideways or degrees; empty: as in the limb file"
+    )
+    obstacles: str = _parameter(
+        "", "file (YAML) of what is in the limb's way: motions into it are refused; empty: nothing"
+    )
+    learned_plans: str = _parameter(
+        "", "folder of learned plans, which commands of the method 'learned' name"
+    )
+    payload: float = _parameter(
+        0.0, "mass [kg] carried, if a command names none", 0.0, HEAVIEST, read_only=False
+    )
+    payload_at: float = _parameter(
+        0.0, "where, along the limb from its clamp [m]; 0: the tip", 0.0, read_only=False
+    )
+    default_model: str = _parameter(
+        "der", "model for paths and for commands that name none", choices=tuple(METHODS)
+    )
+    default_method: str = _parameter(
+        "", "method where none is named; empty: the best", choices=("", *METHODS["der"])
+    )
+    nodes: int = _parameter(21, "nodes of the rod", 6, 201)
+    lead_time: float = _parameter(
+        0.2, "time between sending a setpoint and its stamp [s]", 0.05, 2.0
+    )
+    auto_start: bool = _parameter(True, "play a plan as soon as it is ready")
+    branch: str = _parameter(
+        "", "side of the fold that is taken; empty: the least pressure", choices=("", *BRANCHES)
+    )
+    path_speed: float = _parameter(0.03, "speed along a path without times [m/s]", 1e-3, 1.0)
+    path_acceleration: float = _parameter(0.05, "acceleration along a path [m/s^2]", 1e-3, 10.0)
+    nearest_path: bool = _parameter(
+        False, "follow the nearest path in reach in place of one that leaves it", read_only=False
+    )
+    driver_timeout: float = _parameter(
+        1.0, "silence of the driver [s] after which it counts as dead", 0.2, 60.0
+    )
+    feedback: bool = _parameter(False, "correct plans of the rod while they are played")
+    reaction: Kind = _parameter(
+        "yield", "what feedback does where something touches the limb", choices=KINDS
+    )
+    force_limit: float = _parameter(
+        0.0, "force [N] that 'yield' allows; 0: none more than the plan's", 0.0, 100.0
+    )
 
     def corrected(self, planned: Plan) -> Feedback:
         """Return feedback on a plan, with the reaction to a touch that is set."""
@@ -85,87 +125,26 @@ def read_parameters(node: Node) -> PlannerOptions:
         LimbError: the limb file cannot be used.
         PlanningError: the file of obstacles cannot be used.
     """
-    read: Any = functools.partial(declare, node)
-    limb_file = read("limb_file", "", "limb file (YAML); empty: the default limb")
-    limb = Limb.from_yaml(limb_file) if limb_file else Limb.default()
-    mounting = read(
-        "mounting", "", "horizontal, hanging, standing, sideways or degrees of tilt; empty: "
-        "gravity as in the limb file"
-    )  # fmt: skip
-    in_the_way = read(
-        "obstacles", "", "file (YAML) of what is in the limb's way: a motion that would run into "
-        "it is refused; empty: nothing"
-    )  # fmt: skip
-    learned_plans = read(
-        "learned_plans", "", "folder of learned plans: a command of the method 'learned' names one "
-        "of them in place of its motion"
-    )  # fmt: skip
-    options = PlannerOptions(
-        limb=limb.loaded(Load(mounting=mounting)),
-        limb_file=str(Path(limb_file).absolute()) if limb_file else "",
-        payload=read(
-            "payload", 0.0, "mass [kg] carried beside the limb's own masses, where a command names "
-            "none", at_least=0.0, at_most=HEAVIEST, read_only=False
-        ),
-        payload_at=read(
-            "payload_at", 0.0, "where, along the limb from its clamp [m]; 0: the tip",
-            at_least=0.0, read_only=False
-        ),
-        model=read(
-            "default_model", "der", "model for paths and for commands that name none",
-            choices=tuple(METHODS)
-        ),
-        method=read(
-            "default_method", "", "method where none is named; empty: the best",
-            choices=("", *METHODS["der"])
-        ),
-        nodes=read("nodes", 21, "nodes of the rod", at_least=6, at_most=201),
-        lead=round(
-            NANOSECONDS * read("lead_time", 0.2, "time between sending a setpoint and its stamp "
-                               "[s]", at_least=0.05, at_most=2.0)
-        ),
-        auto_start=read("auto_start", True, "play a plan as soon as it is ready"),
-        branch=read(
-            "branch", "", "side of the fold for shapes and for paths that are not nearest ones; "
-            "empty: the least pressure",
-            choices=("", *BRANCHES)
-        ),
-        limits=PathLimits(
-            read("path_speed", 0.03, "speed along a path without times [m/s]",
-                 at_least=1e-3, at_most=1.0),
-            read("path_acceleration", 0.05, "acceleration along and across it [m/s^2]",
-                 at_least=1e-3, at_most=10.0),
-        ),
-        nearest_path=read(
-            "nearest_path", False, "follow the nearest path that the limb can follow where a path "
-            "leaves its reach, instead of refusing it", read_only=False
-        ),
-        driver_timeout=read(
-            "driver_timeout", 1.0, "silence of the driver [s] after which it counts as dead",
-            at_least=0.2, at_most=60.0
-        ),
-        # As other processes find it.
-        learned_plans=str(Path(learned_plans).expanduser().resolve()) if learned_plans else "",
-        feedback=read(
-            "feedback", False, "correct plans of the rod while they are played, where a command "
-            "does not ask for it"
-        ),
-        reaction=read(
-            "reaction", "yield", "what feedback does where something touches the limb; a limb that "
-            "was never calibrated warns in place of yielding", choices=KINDS
-        ),
-        force_limit=read(
-            "force_limit", 0.0, "force [N] that the reaction 'yield' allows; 0: none more than "
-            "that of the plan", at_least=0.0, at_most=100.0
-        ),
-        obstacles=Obstacles.from_yaml(in_the_way) if in_the_way else None,
-    )  # fmt: skip
-    if options.force_limit and options.reaction != "yield":
+    read: dict[str, Any] = {}
+    for each in dataclasses.fields(PlannerOptions):
+        if each.metadata:
+            more = dict(each.metadata)
+            read[each.name] = declare(node, each.name, each.default, *more.pop("told"), **more)
+    if read["force_limit"] and read["reaction"] != "yield":
         raise ParameterError(
             f"parameter 'force_limit' is what the reaction yield allows, 'reaction' is "
-            f"{options.reaction}: leave one of them out"
+            f"{read['reaction']}: leave one of them out"
         )
-    return options
+    limb = Limb.from_yaml(read["limb_file"]) if read["limb_file"] else Limb.default()
+    for name in ("limb_file", "learned_plans"):  # as other processes find them
+        read[name] = str(Path(read[name]).expanduser().resolve()) if read[name] else ""
+    return PlannerOptions(
+        limb=limb.loaded(Load(mounting=read["mounting"])),
+        lead=round(NANOSECONDS * read["lead_time"]),
+        limits=PathLimits(read["path_speed"], read["path_acceleration"]),
+        in_the_way=Obstacles.from_yaml(read["obstacles"]) if read["obstacles"] else None,
+        **read,
+    )
 
 
 # Messages that ask for a motion ------------------------------------------------------------------
@@ -285,13 +264,13 @@ def _request(
     start = start_of(nanoseconds(message.header.stamp), now)
     carried = message if message.payload else options
     limb = options.limb.loaded(Load(carried.payload, carried.payload_at, message.mounting))
-    model, learned = message.model or options.model, None
+    model, learned = message.model or options.default_model, None
     if motion is None:
         learned = learned_plan(options.learned_plans, message.motion, limb)
         motion = Motion(learned.motion, learned.amplitude, learned.period, learned.cycles)
         limb, model, method = learned.limb, learned.model, LEARNED
     else:
-        method = choose_method(model, message.method or options.method)
+        method = choose_method(model, message.method or options.default_method)
     if message.feedback and model != "der":
         raise ValueError(
             f"feedback corrects plans of the rod, not of the model {model}: ask for der"

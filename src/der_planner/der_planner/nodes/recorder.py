@@ -89,46 +89,31 @@ class Recorder(Node):
 
     def _declare_parameters(self) -> None:
         declare = partial(parameters.declare, self)
-        declare(
-            "output",
-            "",
-            "bag folder that the next start makes; empty: a folder named by the time, in the cwd",
-            read_only=False,
-        )
-        declare(
-            "metadata",
-            "{}",
-            "JSON object stored in the next bag: motion, model, method, trial, seed, versions",
-            read_only=False,
-        )
+        folder = "bag folder that the next start makes; empty: one named by the time"
+        declare("output", "", folder, read_only=False)
+        stored = "JSON object stored in the next bag: motion, model, method, trial, seed, versions"
+        declare("metadata", "{}", stored, read_only=False)
         declare("record_images", False, "record raw images, too", read_only=False)
         declare("autostart", False, "start recording at once")
         declare("topics", ".*", "regular expression that the full topic names must match")
-        declare(
-            "exclude",
-            ".*/image_annotated|.*/_.*",
-            "regular expression of full topic names to leave out; empty: none",
-        )
-        declare(
-            "compression",
-            "auto",
-            "of the bag's chunks; auto: none with images, else zstd",
-            choices=("auto", *COMPRESSIONS),
-        )
+        left_out = "regular expression of full topic names to leave out; empty: none"
+        declare("exclude", ".*/image_annotated|.*/_.*", left_out)
+        packed = "of the bag's chunks; auto: none with images, else zstd"
+        declare("compression", "auto", packed, choices=("auto", *COMPRESSIONS))
         declare("flush_interval", 1.0, "time between flushes [s]", at_least=0.05, at_most=60.0)
         declare("queue_size", 256 << 20, "bytes that may wait for the disk", at_least=1 << 20)
         declare("minimum_free", 64 << 20, "stop below so many free bytes; 0: never", at_least=0)
-        self._wanted = self._pattern("topics", ".*")
-        self._unwanted = self._pattern("exclude", "")
+        self._wanted = self._pattern("topics")
+        self._unwanted = self._pattern("exclude")
 
     def _parameter(self, name: str):
         return self.get_parameter(name).value
 
-    def _pattern(self, name: str, without: str) -> re.Pattern[str]:
-        """Return a parameter's pattern; ``without`` where it is empty."""
+    def _pattern(self, name: str) -> re.Pattern[str]:
+        """Return a parameter's pattern."""
         text = self._parameter(name)
         try:
-            return re.compile(text or without)
+            return re.compile(text)
         except re.error as error:
             raise parameters.ParameterError(
                 f"parameter '{name}' is '{text}', no regular expression: {error}"

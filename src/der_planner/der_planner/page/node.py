@@ -69,23 +69,17 @@ class PageNode(Node):
         read: Callable[..., Any] = functools.partial(declare, self)
         binding = self._read_binding(read)
         previewer = self._read_previewer(read)
-        report = read(
-            "report", "", "folder of an experiment's report: shown as soon as it is there"
-        )
+        report = read("report", "", "folder of an experiment's report, shown once it is there")
         drawings = read("drawings", "~/limb_drawings", "folder of kept drawings")
         share = Path(get_package_share_directory("apriltag_tracker")) / "config"
         tag_map = read("tag_map", str(share / "tags.yaml"), "YAML file: where the tags are")
-        rate = read(
-            "picture_rate", 15.0, "pictures a second at most [Hz]", at_least=1.0, at_most=30.0
-        )
-        self._lease_period: float = read(
-            "lease_period",
-            2.0,
+        rate = read("picture_rate", 15.0, "pictures a second at most [Hz]", 1.0, 30.0)
+        lost = (
             "the driver does as its `on_lost_operator` says when the operator's browser has been "
-            "silent for this time [s]; 0: it is never told",
-            at_least=0.0,
-            at_most=10.0,  # less than the desk is kept, which would give the lease up
+            "silent for this time [s]; 0: it is never told"
         )
+        # At most less than the desk is kept, which would give the lease up.
+        self._lease_period: float = read("lease_period", 2.0, lost, 0.0, 10.0)
         self._leased = False
         # A misspelt name of a protection must not leave the page without it.
         check_overrides(self)
@@ -127,9 +121,8 @@ class PageNode(Node):
         )
 
     def _read_previewer(self, read: Callable[..., Any]) -> Previewer:
-        limb_file = read(
-            "limb_file", "", "the planner's limb file until it is heard; empty: the default limb"
-        )
+        planned = "the planner's limb file until it is heard; empty: the default limb"
+        limb_file = read("limb_file", "", planned)
         self._mounting: str = read("mounting", "", "as the planner's; empty: as in the limb file")
         payload = read("payload", 0.0, "as the planner's [kg]", at_least=0.0)
         place = read("payload_at", 0.0, "as the planner's [m]; 0: the tip", at_least=0.0)
@@ -196,7 +189,7 @@ class PageNode(Node):
         tags = [
             Tag(tag.id, np.array(tag.corners).reshape(4, 2), np.zeros((8, 8)), 0.0)
             for tag in message.detections
-        ]  # fmt: skip
+        ]
         self._overlay.put_tags(nanoseconds(message.header.stamp), tags)
 
     def _on_reference(self, message: PointStamped) -> None:

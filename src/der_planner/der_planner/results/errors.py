@@ -54,27 +54,14 @@ class Split:
     rms_without_gain_m: float
 
 
-@dataclass(frozen=True)
-class ErrorSeries:
-    """Error over time of one run: time (F,) [s], error (F, 2) measured minus reference [m]."""
-
-    time: Array
-    error: Array
-
-    @property
-    def distance(self) -> Array:
-        """|r − r̄| (F,) [m]."""
-        return np.asarray(np.linalg.norm(self.error, axis=1))
-
-
-def error_series(run: RunSeries) -> ErrorSeries:
-    """Return the error at every valid image of the window.
+def error_series(run: RunSeries) -> Stream:
+    """Return the measured tip minus the reference (F, 2) [m] at every valid image of the window.
 
     Raises:
         EvaluationError: there is no valid image in the window.
     """
     tip = _seen(run, *window(run))
-    return ErrorSeries(tip.time, tip.value - run.reference.at(tip.time))
+    return Stream(tip.time, tip.value - run.reference.at(tip.time))
 
 
 def _seen(run: RunSeries, first: float, last: float) -> Stream:

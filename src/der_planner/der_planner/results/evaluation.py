@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from der_planner.arrays import Array
+from der_planner.arrays import Array, rms_distance
 from der_planner.bags.reader import BagError
 from der_planner.bags.record import read_record
 from der_planner.bags.run import EvaluationError, RunSeries
@@ -114,6 +114,7 @@ def evaluate_run(run: RunSeries) -> RunResult:
         EvaluationError: there is no valid image in the window.
     """
     series = error_series(run)
+    distance = np.linalg.norm(series.value, axis=1)
     first, last = window(run)
     images = run.tip.between(first, last).time
     dropped, longest = _gaps(images, series.time, first, last)
@@ -126,13 +127,13 @@ def evaluate_run(run: RunSeries) -> RunResult:
         method=about.method,
         trial=about.trial,
         seed=about.seed,
-        mean_error_m=float(series.distance.mean()),
-        mean_error_x_m=float(np.abs(series.error[:, 0]).mean()),
-        mean_error_y_m=float(np.abs(series.error[:, 1]).mean()),
-        max_error_m=float(series.distance.max()),
+        mean_error_m=float(distance.mean()),
+        mean_error_x_m=float(np.abs(series.value[:, 0]).mean()),
+        mean_error_y_m=float(np.abs(series.value[:, 1]).mean()),
+        max_error_m=float(distance.max()),
         valid_fraction=min(1.0, valid),
         bag=about.bag,
-        rms_error_m=float(np.sqrt(np.mean(series.distance**2))),
+        rms_error_m=rms_distance(series.value),
         predicted_error_m=_predicted_error(run),
         frames=len(images),
         dropped_frames=dropped,

@@ -10,8 +10,8 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
+from matplotlib import style
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
@@ -19,11 +19,11 @@ from matplotlib.figure import Figure
 from der_planner.arrays import Array
 from der_planner.bags.run import RunSeries
 from der_planner.results.errors import error_series
-from der_planner.results.evaluation import DRAWN, RunResult
-from der_planner.results.statistics import learning_curves
+from der_planner.results.evaluation import DRAWN
 from der_planner.results.tables import CASE, several_limbs
 
 FORMATS = ("png", "pdf")
+STYLE = Path(__file__).parents[1] / "data" / "paper.mplstyle"
 CM = 100.0
 COLUMN = 3.5
 """Width of a column of a two-column paper [inch]."""
@@ -63,24 +63,7 @@ def colours_of(runs: Sequence[RunSeries]) -> dict[str, tuple[float, ...]]:
 
 def paper_style() -> AbstractContextManager[None]:
     """Set font sizes and line widths of a two-column paper, without touching the caller's."""
-    return mpl.rc_context(
-        {
-            "font.size": 8,
-            "axes.titlesize": 8,
-            "axes.labelsize": 8,
-            "legend.fontsize": 7,
-            "xtick.labelsize": 7,
-            "ytick.labelsize": 7,
-            "lines.linewidth": 1.2,
-            "axes.linewidth": 0.6,
-            "axes.spines.top": False,
-            "axes.spines.right": False,
-            "legend.frameon": False,
-            "pdf.fonttype": 42,
-            "savefig.dpi": 160,
-            "figure.constrained_layout.use": True,
-        }
-    )
+    return style.context(STYLE)
 
 
 def save(figure: Figure, folder: Path, name: str) -> list[Path]:
@@ -212,7 +195,7 @@ def mean_error(runs: Sequence[RunSeries]) -> tuple[Array, Array, Array]:
     rows = np.full((len(runs), len(grid)), np.nan)
     for row, run in zip(rows, runs, strict=True):
         series = error_series(run)
-        row[:] = np.interp(grid, series.time, series.distance)
+        row[:] = np.interp(grid, series.time, np.linalg.norm(series.value, axis=1))
         nearest = np.searchsorted(series.time, grid).clip(1, len(series.time) - 1)
         away = np.minimum(
             np.abs(grid - series.time[nearest - 1]), np.abs(series.time[nearest] - grid)
@@ -256,30 +239,3 @@ def _draw_pressures(row: Sequence[Axes], run: RunSeries, look: tuple[float, ...]
         stream = getattr(run, name).between(0.0, run.reference.time[-1])
         for segment, axis in enumerate(row if len(stream) else ()):
             axis.plot(stream.time, stream.value[:, segment] / 1000.0, color=look, **drawn)
-
-
-def plot_learning(results: Sequence[RunResult], folder: Path) -> list[Path]:
-    """Draw the learning curves, a line a trial and a column a motion; nothing where there is none.
-
-    Args:
-        results: of an experiment.
-        folder: where ``learning.png`` and ``learning.pdf`` go.
-    """
-    curves = learning_curves(results)
-    if not curves:
-        return []
-    with paper_style():
-        figure: Any = Figure(figsize=(PAGE if len(curves) > 1 else COLUMN, 2.2))
-        axes = figure.subplots(1, len(curves), squeeze=False, sharey=True)[0]
-        for axis, (motion, trials) in zip(axes, curves.items(), strict=True):
-            for model, errors in trials:
-                drawn = {"color": colour(model), "ls": DASHES.get(model, "-."), "marker": "o"}
-                values = np.array(errors) * CM
-                axis.semilogy(np.arange(len(errors)), values, ms=3, label=model.upper(), **drawn)
-            axis.set(xlabel="runs learned from", title=motion.replace("_", " "))
-            axis.xaxis.get_major_locator().set_params(integer=True)
-            axis.yaxis.set_major_formatter("{x:g}")
-            axis.yaxis.set_minor_formatter("{x:.2g}")
-        axes[0].set_ylabel("mean tip error [cm]")
-        shared_legend(figure, axes)
-        return save(figure, folder, "learning")

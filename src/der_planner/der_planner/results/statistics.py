@@ -59,11 +59,9 @@ class Comparison:
         motion: of both.
         model, baseline: with their methods, e.g. ``der optimal``.
         difference_m: positive where the model is better [m]; NaN where refused.
-        low_m, high_m: bootstrap interval of `confidence` [m]; NaN with fewer than two trials.
-        ratio: baseline over model.
+        low_m, high_m: bootstrap interval of `CONFIDENCE` [m]; NaN with fewer than two trials.
         paired: trials were paired by seed.
         trials: (of the model, of the baseline).
-        confidence: of the interval.
         refused: why there is no figure; empty where there is one.
         namespace: of the limb, where the runs are of several; else empty.
         loads: mounting and payload; empty for a horizontal limb without payload.
@@ -75,10 +73,8 @@ class Comparison:
     difference_m: float = float("nan")
     low_m: float = float("nan")
     high_m: float = float("nan")
-    ratio: float = float("nan")
     paired: bool = False
     trials: tuple[int, int] = (0, 0)
-    confidence: float = CONFIDENCE
     refused: str = ""
     namespace: str = ""
     loads: str = ""
@@ -164,11 +160,6 @@ def why_not_comparable(results: Sequence[RunResult]) -> str:
     for run in results:
         if run.problems:
             return f"{run.bag or run.motion} (trial {run.trial}): {'; '.join(run.problems)}"
-    for name, unit in (("amplitude_rad", " rad"), ("period_s", " s"), ("cycles", "")):
-        values = sorted({round(getattr(run, name), 6) for run in results})
-        if len(values) > 1:
-            listed = ", ".join(f"{value:g}{unit}" for value in values)
-            return f"different {name.split('_')[0]}: {listed}"
     windows = {(round(run.window_s[0], 3), round(run.window_s[1], 3)) for run in results}
     if len(windows) > 1:
         return f"different windows: {', '.join(f'{a:g} to {b:g} s' for a, b in sorted(windows))}"
@@ -206,7 +197,6 @@ def _compared(pair: Comparison, runs: list[RunResult], others: list[RunResult]) 
         difference_m=float(two.mean() - one.mean()),
         low_m=low,
         high_m=high,
-        ratio=float(two.mean() / one.mean()),
         paired=differences is not None,
     )
 
@@ -245,24 +235,6 @@ def learned_from(method: str) -> int:
     """Return how many runs a method's plan was learned from: 0 for a first plan."""
     name, count, *_ = [*method.split(), "", ""]
     return int(count) if name == LEARNED and count.isdigit() else 0
-
-
-def learning_curves(results: Sequence[RunResult]) -> dict[str, list[tuple[str, list[float]]]]:
-    """Return by motion the model and mean errors [m] of each trial's runs, in their order.
-
-    Trials that were not learned from are left out.
-    """
-    trials: dict[tuple[str, str, int, str], dict[int, float]] = {}
-    for result in results:
-        # "learned 2 + feedback": what was played beside the plan makes a curve of its own.
-        beside = result.method.partition("+")[2]
-        key = (result.motion, result.model, result.trial, beside)
-        trials.setdefault(key, {})[learned_from(result.method)] = result.mean_error_m
-    curves: dict[str, list[tuple[str, list[float]]]] = {}
-    for (motion, model, *_), errors in trials.items():
-        if max(errors) > 0 and 0 in errors:
-            curves.setdefault(motion, []).append((model, [errors[k] for k in sorted(errors)]))
-    return curves
 
 
 def control_of(method: str) -> str:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, fields
 from typing import TypeVar
 
 from der_planner.results.evaluation import NEAREST
-from der_planner.results.statistics import Comparison, Summary
+from der_planner.results.statistics import CONFIDENCE, Comparison, Summary
 
 CASE = {
     "asynchronous": "1, asynchronous",
@@ -180,7 +180,7 @@ def format_comparison(comparison: Comparison) -> str:
         return f"{text} error (one trial, no interval)"
     how = "paired by seed" if comparison.paired else "unpaired"
     return (
-        f"{text} error, {comparison.confidence:.0%} interval of the difference "
+        f"{text} error, {CONFIDENCE:.0%} interval of the difference "
         f"{comparison.low_m * CM:.2f} to {comparison.high_m * CM:.2f} cm ({how}, bootstrap)"
     )
 

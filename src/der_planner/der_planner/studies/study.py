@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from statistics import NormalDist
 from typing import Any
 
 import numpy as np
@@ -54,9 +55,7 @@ class Spread:
     def value(self, share: float) -> Value:
         """Return the value below which ``share`` (0 … 1) of the draws lie."""
         if self.scale == "normal":
-            from scipy.stats import norm  # noqa: PLC0415
-
-            return float(norm.ppf(share, self.low, self.high))
+            return NormalDist(self.low, self.high).inv_cdf(share)
         if self.scale == "log":
             return float(self.low * math.exp(share * math.log(self.high / self.low)))
         return float(self.low + share * (self.high - self.low))

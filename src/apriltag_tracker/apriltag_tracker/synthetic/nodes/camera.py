@@ -12,14 +12,9 @@ import numpy as np
 from ament_index_python.packages import get_package_share_directory
 from sensor_msgs.msg import CameraInfo, Image
 
-from apriltag_tracker.synthetic.camera import (
-    CameraModel,
-    Errors,
-    Optics,
-    SyntheticCamera,
-)
+from apriltag_tracker.synthetic.camera import CameraModel, Errors, Optics, SyntheticCamera
 from apriltag_tracker.synthetic.nodes import ShapeListener
-from apriltag_tracker.synthetic.shapes import Shape, constant_curvature
+from apriltag_tracker.synthetic.shapes import Shape
 from apriltag_tracker.tag_map import TagMap
 from limb_interfaces import qos, stamps, topics
 from limb_interfaces.parameters import check_overrides, declare
@@ -36,44 +31,31 @@ class SyntheticCameraNode(ShapeListener):
         super().__init__("synthetic_camera")
         cv2.setNumThreads(1)
         share = Path(get_package_share_directory("apriltag_tracker")) / "config"
-        tag_map = declare(
-            self, "tag_map", str(share / "tags.yaml"), "YAML file: where the tags are"
-        )
-        camera = declare(
-            self,
-            "camera_file",
-            str(share / "synthetic_camera.yaml"),
-            "YAML file: lens and place of the rendered camera",
-        )
-        seed = declare(self, "seed", 0, "of noise, floor and set-up errors", at_least=0)
-        number = functools.partial(declare, self)
+        read = functools.partial(declare, self)
+        tag_map = read("tag_map", str(share / "tags.yaml"), "YAML file: where the tags are")
+        looks = "YAML file: lens and place of the rendered camera"
+        camera = read("camera_file", str(share / "synthetic_camera.yaml"), looks)
+        seed = read("seed", 0, "of noise, floor and set-up errors", at_least=0)
         blurred, lit = "blur of the lens, standard deviation in px", "light's range over its mean"
         optics = Optics(
-            noise=number("noise", Optics.noise, "noise of a pixel, grey levels", 0.0, 30.0),
-            blur=number("blur", Optics.blur, blurred, 0.0, 4.0),
-            exposure=number("exposure", Optics.exposure, "exposure time in s", 0.0, 0.1),
-            light_fall=number("light_fall", Optics.light_fall, lit, 0.0, 1.0),
+            noise=read("noise", Optics.noise, "noise of a pixel, grey levels", 0.0, 30.0),
+            blur=read("blur", Optics.blur, blurred, 0.0, 4.0),
+            exposure=read("exposure", Optics.exposure, "exposure time in s", 0.0, 0.1),
+            light_fall=read("light_fall", Optics.light_fall, lit, 0.0, 1.0),
         )
         surveyed, mounted = "how far fixed tags are from the tag map, in m", "the same of limb tags"
         errors = Errors(
-            survey=number("survey_error", 0.0, surveyed, 0.0, 0.01),
-            mounting=number("mounting_error", 0.0, mounted, 0.0, 0.01),
-            mounting_angle=number("mounting_angle_error", 0.0, "limb tags' turn, in rad", 0.0, 0.3),
+            survey=read("survey_error", 0.0, surveyed, 0.0, 0.01),
+            mounting=read("mounting_error", 0.0, mounted, 0.0, 0.01),
+            mounting_angle=read("mounting_angle_error", 0.0, "limb tags' turn, in rad", 0.0, 0.3),
         )
         check_overrides(self)
         tags = TagMap.from_yaml(str(tag_map))
         self._camera = SyntheticCamera(
             CameraModel.from_yaml(str(camera)), tags, optics, errors, int(seed)
         )
-        # Draw once, so that no frame of a run waits for a compiler.
-        straight = constant_curvature(tags.segment_lengths, [0.0] * len(tags.segment_lengths))
-        self._camera.frame(straight, straight)
         self._before: tuple[int, Shape] | None = None
         self._image = self._image_message()
-        size = self._camera.model.intrinsics
-        self._pixels = np.frombuffer(self._image.data, np.uint8).reshape(size.height, size.width)
-        """The picture in the message, which is drawn anew for every shape."""
-        self._camera.prepare(self._pixels)
         self._info = self._info_message()
         self._images = self.create_publisher(Image, topics.IMAGE, qos.SENSOR_DATA)
         self._infos = self.create_publisher(CameraInfo, topics.CAMERA_INFO, qos.LATCHED)
@@ -85,8 +67,6 @@ class SyntheticCameraNode(ShapeListener):
         size = self._camera.model.intrinsics
         message = Image(height=size.height, width=size.width, encoding="mono8", step=size.width)
         message.header.frame_id = FRAME
-        # rclpy copies an array.array in one piece; other sequences go through element by element.
-        message.data = array.array("B", bytes(size.width * size.height))
         return message
 
     def _info_message(self) -> CameraInfo:
@@ -109,15 +89,15 @@ class SyntheticCameraNode(ShapeListener):
 
     def show(self, stamp: int, shape: Shape) -> None:
         """Render the shape."""
-        # Into the message itself, where everything but the limb has been drawn meanwhile.
-        self._camera.frame(shape, self._velocity(stamp, shape))
+        picture = self._camera.frame(shape, self._velocity(stamp, shape)).image
+        # rclpy copies an array.array in one piece; other sequences go through element by element.
+        self._image.data = array.array("B", picture.tobytes())
         self._image.header.stamp = stamps.stamp_from_nanoseconds(stamp)
         self._images.publish(self._image)
         self._before = (stamp, shape)
         if time.monotonic() - self._last_info > _INFO_PERIOD:
             self._info.header.stamp = self._image.header.stamp
             self._publish_info()
-        self._camera.prepare(self._pixels)
 
     def _velocity(self, stamp: int, shape: Shape) -> Shape | None:
         """Return how fast the limb moves, from this shape and the one before."""

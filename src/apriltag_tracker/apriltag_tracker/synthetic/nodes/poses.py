@@ -32,15 +32,11 @@ class SyntheticPosesNode(ShapeListener):
         body_map = declare(self, "body_map", str(share), "YAML file: which body is where")
         form = str(declare(self, "form", _FORMS[0], "messages in which poses go", choices=_FORMS))
         seed = declare(self, "seed", 0, "of noise and dropouts", at_least=0)
-        swapped = str(declare(self, "swapped", "", "bodies with each other's names: NAME,NAME"))
         number = functools.partial(declare, self)
         faults = MocapFaults(
             position_noise=number("position_noise", 1e-4, "of a coordinate [m]", 0.0, 0.01),
             direction_noise=number("direction_noise", 2e-3, "of a turn [rad]", 0.0, 0.3),
             dropout=number("dropout", 0.0, "share of frames without a body", 0.0, 1.0),
-            swapped=tuple(swapped.split(",")) if swapped else (),
-            swapped_from=number("swapped_from", 0.0, "[s] since the first frame", 0.0, 1e6),
-            delay=number("delay", 0.0, "by which stamps are late [s]", -0.5, 0.5),
         )
         tilt = number("tilt", 0.0, "of the plane of motion against the floor [rad]", -2.0, 2.0)
         up = str(declare(self, "up", "z", "axis that points up", choices=tuple(UPRIGHT)))
