@@ -14,7 +14,7 @@ from der_planner.bags.reader import BagError
 from der_planner.bags.run import Description, EvaluationError, RunSeries
 from der_planner.bags.series import load_run
 from der_planner.results.evaluation import RunResult, evaluate_bags, evaluate_run
-from der_planner.results.figures import plot_error, plot_pressures, plot_tip
+from der_planner.results.figures import plot_error, plot_learning, plot_pressures, plot_tip
 from der_planner.results.report import write_report, write_results
 from der_planner.results.statistics import compare, summarise
 from der_planner.results.tables import format_table
@@ -31,6 +31,7 @@ __all__ = [
     "format_table",
     "load_run",
     "plot_error",
+    "plot_learning",
     "plot_pressures",
     "plot_tip",
     "summarise",

@@ -19,7 +19,8 @@ from matplotlib.figure import Figure
 from der_planner.arrays import Array
 from der_planner.bags.run import RunSeries
 from der_planner.results.errors import error_series
-from der_planner.results.evaluation import DRAWN
+from der_planner.results.evaluation import DRAWN, RunResult
+from der_planner.results.statistics import learning_curves
 from der_planner.results.tables import CASE, several_limbs
 
 FORMATS = ("png", "pdf")
@@ -239,3 +240,30 @@ def _draw_pressures(row: Sequence[Axes], run: RunSeries, look: tuple[float, ...]
         stream = getattr(run, name).between(0.0, run.reference.time[-1])
         for segment, axis in enumerate(row if len(stream) else ()):
             axis.plot(stream.time, stream.value[:, segment] / 1000.0, color=look, **drawn)
+
+
+def plot_learning(results: Sequence[RunResult], folder: Path) -> list[Path]:
+    """Draw the learning curves, a line a trial and a column a motion; nothing where there is none.
+
+    Args:
+        results: of an experiment.
+        folder: where ``learning.png`` and ``learning.pdf`` go.
+    """
+    curves = learning_curves(results)
+    if not curves:
+        return []
+    with paper_style():
+        figure: Any = Figure(figsize=(PAGE if len(curves) > 1 else COLUMN, 2.2))
+        axes = figure.subplots(1, len(curves), squeeze=False, sharey=True)[0]
+        for axis, (motion, trials) in zip(axes, curves.items(), strict=True):
+            for model, errors in trials:
+                drawn = {"color": colour(model), "ls": DASHES.get(model, "-."), "marker": "o"}
+                values = np.array(errors) * CM
+                axis.semilogy(np.arange(len(errors)), values, ms=3, label=model.upper(), **drawn)
+            axis.set(xlabel="runs learned from", title=motion.replace("_", " "))
+            axis.xaxis.get_major_locator().set_params(integer=True)
+            axis.yaxis.set_major_formatter("{x:g}")
+            axis.yaxis.set_minor_formatter("{x:.2g}")
+        axes[0].set_ylabel("mean tip error [cm]")
+        shared_legend(figure, axes)
+        return save(figure, folder, "learning")

@@ -17,6 +17,7 @@ from der_planner.files import write_whole
 from der_planner.results.evaluation import DRAWN, RunResult, json_value
 from der_planner.results.figures import (
     plot_error,
+    plot_learning,
     plot_pressures,
     plot_tip,
 )
@@ -42,6 +43,7 @@ _CAPTIONS = {
     "tip": "Measured tip against the reference: path in the plane, x and y over time.",
     "shapes": "Planned and measured limb, over the camera's frames where these were recorded.",
     "pressures": "Differential pressures, commanded and measured; first trial of each model.",
+    "learning": "Mean tip error over the runs that a plan was learned from, a line a trial.",
 }
 _PAGE = Template((Path(__file__).parent / "page.html").read_text(encoding="utf-8"))
 
@@ -101,6 +103,7 @@ def write_report(
         "tip": lambda: plot_tip(runs, folder),
         "shapes": lambda: plot_shapes(runs, folder),
         "pressures": lambda: plot_pressures(runs, folder),
+        "learning": lambda: plot_learning(results, folder),
     }
     for name, plot in plots.items():
         progress(f"figure {name}")

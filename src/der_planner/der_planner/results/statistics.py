@@ -237,6 +237,24 @@ def learned_from(method: str) -> int:
     return int(count) if name == LEARNED and count.isdigit() else 0
 
 
+def learning_curves(results: Sequence[RunResult]) -> dict[str, list[tuple[str, list[float]]]]:
+    """Return by motion the model and mean errors [m] of each trial's runs, in their order.
+
+    Trials that were not learned from are left out.
+    """
+    trials: dict[tuple[str, str, int, str], dict[int, float]] = {}
+    for result in results:
+        # "learned 2 + feedback": what was played beside the plan makes a curve of its own.
+        beside = result.method.partition("+")[2]
+        key = (result.motion, result.model, result.trial, beside)
+        trials.setdefault(key, {})[learned_from(result.method)] = result.mean_error_m
+    curves: dict[str, list[tuple[str, list[float]]]] = {}
+    for (motion, model, *_), errors in trials.items():
+        if max(errors) > 0 and 0 in errors:
+            curves.setdefault(motion, []).append((model, [errors[k] for k in sorted(errors)]))
+    return curves
+
+
 def control_of(method: str) -> str:
     """Return which of `CONTROLS` a run's method belongs to."""
     learned = "learned" if learned_from(method) else ""
