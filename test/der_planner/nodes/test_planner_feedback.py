@@ -82,9 +82,11 @@ def test_the_end_of_a_motion_ends_its_touch_and_says_why_it_vented():
     corrector.close()
 
 
-def test_a_touch_is_published_while_it_lasts():
+def test_a_touch_is_published_and_drawn_while_it_lasts():
     from dataclasses import replace
     from unittest.mock import Mock
+
+    from visualization_msgs.msg import Marker
 
     from der_planner.control.force import untouched
     from der_planner.limb import Limb
@@ -109,13 +111,16 @@ def test_a_touch_is_published_while_it_lasts():
         pressure=np.array([500.0, 0.0]), force_covariance=0.01 * np.eye(2), said="0.30 N",
     )  # fmt: skip
     output.contact(schedule, found)
-    told = sent[topics.CONTACT]
+    told, (arrow,) = sent[topics.CONTACT], sent[topics.SHAPE_MARKERS].markers
     assert (told.touched, told.said, told.arc_length) == (True, "0.30 N", 0.1)
     assert nanoseconds(told.header.stamp) == 3_000_000_000
     assert nanoseconds(told.since) == 2_500_000_000
     assert told.point.x == pytest.approx(0.1)
+    assert arrow.action == Marker.ADD
+    np.testing.assert_allclose([arrow.points[0].x, arrow.points[0].y], [0.1, -0.03], atol=1e-6)
     output.contact(schedule, nothing)
     assert not sent[topics.CONTACT].touched
+    assert sent[topics.SHAPE_MARKERS].markers[0].action == Marker.DELETE
 
 
 @pytest.mark.slow

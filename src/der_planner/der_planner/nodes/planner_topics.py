@@ -33,6 +33,9 @@ REFERENCE = ColorRGBA(r=0.1, g=0.6, b=0.2, a=1.0)
 PREDICTED = ColorRGBA(r=0.9, g=0.5, b=0.1, a=1.0)
 ESTIMATED = ColorRGBA(r=0.1, g=0.4, b=0.9, a=0.7)
 LIMB = ColorRGBA(r=0.1, g=0.6, b=0.2, a=0.5)
+TOUCH = ColorRGBA(r=0.9, g=0.1, b=0.1, a=1.0)
+_METRES_PER_NEWTON = 0.1
+"""Length of the arrow that is drawn for a force."""
 
 
 # What is published -------------------------------------------------------------------------------
@@ -117,7 +120,7 @@ class PlannerPublishers:
         self._draw(self._line("estimate", curve, ESTIMATED, 0.004))
 
     def contact(self, schedule: Schedule, touch: Touch) -> None:
-        """Publish what touches the limb.
+        """Publish what touches the limb, and draw its force where both can be told.
 
         Args:
             schedule: that is played.
@@ -132,12 +135,20 @@ class PlannerPublishers:
         )  # fmt: skip
         told.force = Vector3(x=float(touch.force[0]), y=float(touch.force[1]))
         told.point = Point(x=math.nan, y=math.nan)
+        arrow = self._line("contact", np.empty((0, 2)), TOUCH, 0.002)
+        arrow.type, arrow.action = Marker.ARROW, Marker.DELETE
         if touch.touched:
             told.since = stamp_from_nanoseconds(schedule.start + round(touch.since * NANOSECONDS))
             curve = schedule.plan.body.kinematics.curve(touch.bend_angles)
             along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1)))
-            told.point = _points(interpolate(np.full(1, touch.place), along, curve))[0]
+            ends = interpolate(np.full(1, touch.place), along, curve)
+            ends = np.concatenate([ends - _METRES_PER_NEWTON * touch.force, ends])
+            told.point = _points(ends)[1]
+            if np.isfinite(ends).all():
+                arrow.action, arrow.points = Marker.ADD, _points(ends)
+                arrow.scale.y = 2.0 * arrow.scale.x
         self._contacts.publish(told)
+        self._draw(arrow)
 
     def reference_limb(self, schedule: Schedule, index: int, lead: int) -> None:
         """Draw the reference limb as it should be now, ``lead`` [ns] before setpoint ``index``."""
