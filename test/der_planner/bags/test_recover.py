@@ -91,8 +91,7 @@ def test_a_hole_takes_the_chunks_that_it_touches_and_no_other(
     whole = file.read_bytes() if finished else file.read_bytes()[: ends[-1]]
     if not finished:
         (tmp_path / "run" / "metadata.yaml").unlink()
-    # Without an index, the first chunk alone says what the topics are.
-    for place in range(0 if finished else ends[0], len(whole) - HOLE, 5003):
+    for place in range(0, len(whole) - HOLE, 5003):
         noise = np.random.default_rng(place).integers(0, 256, HOLE, dtype=np.uint8).tobytes()
         broken = whole[:place] + (fill * HOLE if fill else noise) + whole[place + HOLE :]
         file.write_bytes(broken)
@@ -106,6 +105,29 @@ def test_a_hole_takes_the_chunks_that_it_touches_and_no_other(
         assert found.lost_bytes > 0
         assert file.read_bytes() == broken
         shutil.rmtree(found.folder)
+
+
+@pytest.mark.parametrize("repeated", [True, False])
+def test_topics_are_known_though_the_first_chunk_is_damaged(tmp_path, monkeypatch, repeated):
+    if not repeated:  # as in bags of recorders that say it once
+        monkeypatch.setattr(BagWriter, "_repeat_definitions", lambda _: None)
+    folder = tmp_path / "run"
+    ends = write_chunks(folder, 4)
+    file = folder / "run_0.mcap"
+    data = bytearray(file.read_bytes()[: ends[-1]])  # killed, too: no index that knows topics
+    data[data.find(b"0 \0")] ^= 0xFF
+    file.write_bytes(data)
+    if not repeated:
+        with pytest.raises(RecoverError, match="15 messages can be read, but"):
+            recover_bag(folder)
+        return
+    found = recover_bag(folder)
+    assert found.lost_bytes > 0
+    assert found.unnamed == 0
+    assert numbers(found.folder) == list(range(5, 20))
+    with BagReader(folder) as reader:  # the damaged bag itself
+        assert reader.unfinished
+        assert len(list(reader.raw())) == 15
 
 
 def test_what_is_no_bag_is_named(tmp_path: Path):

@@ -60,12 +60,14 @@ class Recovery:
         folder: the new bag; None where the source is whole and nothing was written.
         message_count: that could be read.
         lost_bytes: in damaged chunks and in what is no record.
+        unnamed: messages that could be read, but whose topic nothing in the file tells.
     """
 
     source: Path
     folder: Path | None
     message_count: int
     lost_bytes: int
+    unnamed: int
 
 
 class _File:
@@ -100,6 +102,7 @@ class _File:
             if channel.schema_id in schemas
         }
         self.message_count = sum(counts[number] for number in self._topics)
+        self.unnamed = counts.total() - self.message_count
 
     def messages(self) -> Iterator[tuple[TopicSpec, Message]]:
         """Yield the messages whose topic is known, in the order of the file."""
@@ -195,14 +198,18 @@ def recover_bag(path: Path, folder: Path | None = None) -> Recovery:
         folder=folder,
         message_count=sum(file.message_count for file in files),
         lost_bytes=sum(file.lost_bytes for file in files),
+        unnamed=sum(file.unnamed for file in files),
     )
     is_whole = not found.lost_bytes and all(file.has_index for file in files)
     if folder is None and is_whole and (path.is_file() or (path / METADATA_FILE).exists()):
         return found
-    if not found.message_count:
+    if not found.message_count and found.unnamed:
         raise RecoverError(
-            f"{path} holds no whole message of a known topic: nothing can be recovered"
+            f"{path}: {found.unnamed} messages can be read, but what their topics are was in a "
+            "damaged part of the file: nothing can be recovered"
         )
+    if not found.message_count:
+        raise RecoverError(f"{path} holds no whole message: nothing can be recovered")
     folder = folder or path.with_name(path.name.removesuffix(".mcap") + "_recovered")
     custom = {key: text for file in files for key, text in file.custom_data.items()}
     bag = BagWriter(folder, custom, compression=files[0].compression)
@@ -217,7 +224,8 @@ def describe(found: Recovery) -> str:
     held = f"{found.source}: {found.message_count} messages"
     if found.folder is None:
         return f"{held}, whole, nothing to recover"
-    return f"{held} saved in {found.folder}; lost: {found.lost_bytes} bytes"
+    text = f"{held} saved in {found.folder}; lost: {found.lost_bytes} bytes"
+    return text + f", {found.unnamed} messages whose topic nothing tells" * bool(found.unnamed)
 
 
 def main() -> int:

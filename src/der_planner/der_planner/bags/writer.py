@@ -17,6 +17,8 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from mcap.data_stream import RecordBuilder
+from mcap.records import Channel, Schema
 from mcap.writer import CompressionType, Writer
 
 from der_planner.bags.topics import TopicSpec
@@ -30,6 +32,8 @@ CHUNK_SIZE = 1 << 20
 LARGE = 1 << 17
 """Messages of so many bytes get a chunk of their own, so that whoever reads only the small ones
 does not have to read the images between them."""
+REPEATS = 3
+"""A topic's definition is repeated outside of chunks at so many flushes after its first message."""
 PROFILE = "ros2"
 LIBRARY = "der_planner recorder"
 
@@ -71,8 +75,9 @@ class BagWriter:
         self._small: list[tuple[TopicSpec, int, int, bytes]] = []
         self._small_bytes = 0
         self._sequences: dict[str, int] = {}
-        self._channels: dict[str, int] = {}
-        self._schemas: dict[str, int] = {}
+        self._channels: dict[str, Channel] = {}
+        self._schemas: dict[str, Schema] = {}
+        self._repeats: dict[str, int] = {}
         self.byte_count = 0
         """Bytes in the file; what waits for the next flush is not counted."""
         self._closed = False
@@ -128,6 +133,7 @@ class BagWriter:
         """
         with self._guarded():
             self._emit_small()
+            self._repeat_definitions()
         if not (self.folder / self._name).exists():
             self._abandon()
             raise BagWriteError(
@@ -182,7 +188,7 @@ class BagWriter:
         sequence = self._sequences.get(spec.name, 0)
         self._sequences[spec.name] = sequence + 1
         self._writer.add_message(
-            channel_id=self._channels[spec.name],
+            channel_id=self._channels[spec.name].id,
             log_time=log_time,
             publish_time=publish_time,
             sequence=sequence & 0xFFFFFFFF,
@@ -191,13 +197,28 @@ class BagWriter:
 
     def _register(self, spec: TopicSpec) -> None:
         if spec.type_name not in self._schemas:
-            self._schemas[spec.type_name] = self._writer.register_schema(
-                spec.type_name, spec.encoding, spec.definition.encode()
-            )
+            text = spec.definition.encode()
+            number = self._writer.register_schema(spec.type_name, spec.encoding, text)
+            self._schemas[spec.type_name] = Schema(number, text, spec.encoding, spec.type_name)
         about = {"offered_qos_profiles": spec.qos_yaml(), "topic_type_hash": spec.type_hash}
-        self._channels[spec.name] = self._writer.register_channel(
-            spec.name, "cdr", self._schemas[spec.type_name], about
-        )
+        schema = self._schemas[spec.type_name].id
+        number = self._writer.register_channel(spec.name, "cdr", schema, about)
+        self._channels[spec.name] = Channel(number, spec.name, "cdr", about, schema)
+        self._repeats[spec.name] = REPEATS
+
+    def _repeat_definitions(self) -> None:
+        """Write what is known of young topics again, outside of chunks.
+
+        A topic's schema and channel lie in the chunk of its first message: if that chunk were
+        damaged, nobody could read the others.
+        """
+        records = RecordBuilder()
+        for name in self._repeats:
+            self._schemas[self._topics[name].type_name].write(records)
+            self._channels[name].write(records)
+        self._file.write(records.end())
+        self._end_chunk()
+        self._repeats = {name: left - 1 for name, left in self._repeats.items() if left > 1}
 
     @contextlib.contextmanager
     def _guarded(self) -> Iterator[None]:
