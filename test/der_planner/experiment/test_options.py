@@ -23,6 +23,7 @@ from der_planner.planning import ObstacleError
         (["--nearest"], "--nearest is about a path"),
         (["--page", "70000"], "--page is 70000"),
         (["--page", "--offline"], "does not go with --offline"),
+        (["--library", "/nowhere"], "/nowhere is no folder"),
         (["--poses", "--offline"], "--poses is motion capture of the twin"),
         (["--force-limit", "0.2"], "about feedback: add --feedback"),
         (["--feedback", "--reaction", "hold", "--force-limit", "0.2"], "what the reaction yield"),

@@ -327,6 +327,10 @@ def parse(arguments: Sequence[str]) -> Options:
             "--page shows a running graph: it does not go with --offline",
         ),
         (
+            given.record_images and given.offline,
+            "--record-images is about bags: it does not go with --offline, which films nothing",
+        ),
+        (
             hardware is not None and given.offline,
             "--offline simulates everything: it does not go with --hardware",
         ),
@@ -355,6 +359,10 @@ def parse(arguments: Sequence[str]) -> Options:
         (
             given.force_limit and given.reaction != "yield",
             "--force-limit is what the reaction yield allows: leave --reaction out",
+        ),
+        (
+            given.library is not None and not given.library.is_dir(),
+            f"--library {given.library} is no folder: name one of learned plans",
         ),
     ):
         if wrong:
