@@ -119,14 +119,7 @@ def fit(
             f"the weight is said to hang at {weight[1]:g} m along a limb of {limb.length:.3g} m: "
             "give metres from its clamp (--at), or the limb's lengths in the limb file of --prior"
         )
-    found, report = _fit(limb, log, groups, longest_gap, weight)
-    late, deviation = report.delay
-    if abs(late) < max(SHORTEST_DELAY, 3.0 * deviation):
-        return found, report
-    # What was seen late would pass for damping and inertia.
-    earlier = log.seen_earlier(late, longest_gap)
-    found, report = _fit(limb, earlier, groups, longest_gap, weight)
-    return found, replace(report, delay=(late + report.delay[0], report.delay[1]), taken_out=late)
+    return _fit(limb, log, groups, longest_gap, weight)
 
 
 def _fit(
@@ -135,8 +128,9 @@ def _fit(
     groups: Collection[str],
     longest_gap: float,
     weight: tuple[float, float] | None,
+    taken_out: float = 0.0,
 ) -> tuple[Limb, FitReport]:
-    """Identify a limb from a log whose stamps are true."""
+    """Identify a limb from a log from whose stamps a delay [s] was taken off."""
     recorded = prepare(log, limb, longest_gap)
     hung = HungWeight.found(recorded, *weight) if weight else None
     if hung is not None:
@@ -166,6 +160,11 @@ def _fit(
         unknowns, correlation = told(fitted.problem, fitted.values)
         unknowns += left
         warnings.append(said)
+    late, doubt = fitted.problem.delay(fitted.values)
+    if not taken_out and abs(late) >= max(SHORTEST_DELAY, 3.0 * doubt):
+        # What was seen late would pass for damping and inertia.
+        earlier = log.seen_earlier(late, longest_gap)
+        return _fit(limb, earlier, groups, longest_gap, weight, late)
     warnings += at_bounds(fitted.free, fitted.values)
     found = _calibrated(fitted, limb, air, recorded)
     span = np.ptp(prepared.bend[prepared.usable], axis=0)
@@ -188,7 +187,8 @@ def _fit(
         span=span,
         duration=float(np.ptp(prepared.log.time)),
         rows=int(prepared.usable.sum()),
-        delay=fitted.problem.delay(fitted.values),
+        delay=(taken_out + late, doubt),
+        taken_out=taken_out,
         warnings=tuple(warnings),
         weight="" if hung is None else str(hung),
     )
