@@ -74,16 +74,6 @@ def test_the_step_size_does_not_matter():
 # ------------------------------------------------------------------------------------ board
 
 
-def test_a_command_is_stamped_with_its_first_byte():
-    board = EmulatedBoard(BOARDS["ezloop"](), BoardPneumatics(2), 0)
-    first, second = b"<1013.00,1014.00,1015.00,1016.00>\n", b"<1013.00,1013.00,1013.00,1013.00>\n"
-    pieces = [(b"junk" + first[:3], 100), (first[3:20], 200), (first[20:] + second[:1], 300)]
-    received = [c for data, stamp in pieces for c in board.receive(data, stamp)[0]]
-    received += board.receive(second[1:], 400)[0]
-    assert [c.stamp for c in received] == [100, 300]
-    assert received[0].pressure == pytest.approx((101300.0, 101400.0, 101500.0, 101600.0))
-
-
 @pytest.mark.parametrize(
     "text", ["jam", "stick", "stick:4", "stick:0.5", "stick:-1", "drop:1.5", "mute:1", "leak:a"]
 )

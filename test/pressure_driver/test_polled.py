@@ -24,7 +24,7 @@ def answer(host, *words):
 
 def told(data):
     """Return first register and words of a write, which is alone: servers lose a second request."""
-    ((_, write),) = festo.ModbusReader().feed(data)
+    (write,) = festo.cut_frames(bytearray(data))
     first, count = struct.unpack(">HH", write.data[:4])
     words = festo.to_words(write.data[5:])
     assert len(words) == count

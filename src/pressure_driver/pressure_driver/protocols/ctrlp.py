@@ -56,11 +56,6 @@ class CtrlpHost(LineHost):
     )
     echoes = True
 
-    def __init__(self, chamber_count: int = 4) -> None:
-        super().__init__(chamber_count)
-        self.unsettled = _UNITS_UNKNOWN
-        self._times: deque[int] = deque(maxlen=4)
-
     def doubt(self) -> None:
         """Have the units confirmed again before the next setpoint."""
         self.unsettled = _UNITS_UNKNOWN
@@ -68,7 +63,7 @@ class CtrlpHost(LineHost):
     def reset(self) -> None:
         """Forget a half-received line and everything that the board has confirmed."""
         super().reset()
-        self._times.clear()
+        self._times = deque[int](maxlen=4)
         self.doubt()
 
     def start(self) -> bytes:

@@ -53,10 +53,6 @@ class EzloopHost(LineHost):
     tells_pascals = True
     reach = LARGEST_WIRE_VALUE * PASCAL_PER_HECTOPASCAL
 
-    def __init__(self, chamber_count: int = 4) -> None:
-        super().__init__(chamber_count)
-        self._reporting = False
-
     def start(self) -> bytes:
         """A line end, which finishes whatever an earlier program left half-sent."""
         return b"\n"

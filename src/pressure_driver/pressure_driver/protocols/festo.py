@@ -27,16 +27,16 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 from pressure_driver.protocols import (
     BoardFailure,
     Echo,
     Event,
-    FrameBuffer,
     HostProtocol,
     Telemetry,
+    skip_to,
 )
 
 if TYPE_CHECKING:
@@ -100,27 +100,24 @@ def signed(word: int) -> int:
     return word - 0x10000 if word & 0x8000 else word
 
 
-class ModbusReader(FrameBuffer):
-    """Cuts a byte stream into frames.
+def cut_frames(kept: bytearray) -> Iterator[ModbusFrame | None]:
+    """Take complete frames.
 
     TCP loses and changes nothing. What does not begin as a frame is skipped to where one may begin.
     """
-
-    def feed(self, data: bytes) -> list[tuple[int, ModbusFrame]]:
-        """Return (place of the first byte, frame) of those that became complete."""
-        frames: list[tuple[int, ModbusFrame]] = []
-        self.kept += data
-        while len(self.kept) >= HEADER.size:
-            transaction, zero, length, _, function = HEADER.unpack_from(self.kept)
-            if zero or not 2 < length <= LONGEST_LENGTH:
-                # The two zero bytes stand behind the transaction.
-                self.skip_to(self.kept.find(b"\0\0", 3) - 2)
-                continue
-            if len(self.kept) < LENGTH_BEGINS + length:
-                break
-            place, frame = self.position, self.take(LENGTH_BEGINS + length)
-            frames.append((place, ModbusFrame(transaction, function, frame[HEADER.size :])))
-        return frames
+    while len(kept) >= HEADER.size:
+        transaction, zero, length, _, function = HEADER.unpack_from(kept)
+        if zero or not 2 < length <= LONGEST_LENGTH:
+            # The two zero bytes stand behind the transaction.
+            skip_to(kept.find(b"\0\0", 3) - 2, kept)
+            yield None
+            continue
+        end = LENGTH_BEGINS + length
+        if len(kept) < end:
+            break
+        data = bytes(kept[HEADER.size : end])
+        del kept[:end]
+        yield ModbusFrame(transaction, function, data)
 
 
 def slot_word(mode: int, control: int) -> int:
@@ -142,10 +139,7 @@ class FestoHost(HostProtocol):
     echoes = True
     resolution = PASCAL_PER_MILLIBAR
 
-    def __init__(self, chamber_count: int = 4) -> None:
-        super().__init__(chamber_count, ModbusReader())
-        self._motion_terminal = True
-        self.reset()
+    _motion_terminal = True
 
     def configure(self, settings: Settings) -> None:
         """Take over which valves the terminal has."""
@@ -203,6 +197,9 @@ class FestoHost(HostProtocol):
         return encode(self._next(), WRITE, head + to_bytes(words))
 
     # ----------------------------------------------------------------------- from the terminal
+
+    def _cut(self) -> Iterator[ModbusFrame | None]:
+        return cut_frames(self._kept)
 
     def _interpret(self, frame: ModbusFrame) -> list[Event]:
         if frame.function == WRITE and len(frame.data) == BLOCK.size:

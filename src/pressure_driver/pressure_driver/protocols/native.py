@@ -25,8 +25,8 @@ from pressure_driver.protocols import (
     Echo,
     Event,
     HostProtocol,
-    StreamCutter,
     Telemetry,
+    cut_at,
 )
 
 if TYPE_CHECKING:
@@ -113,15 +113,9 @@ def encode(kind: FrameType, sequence: int, body: bytes = b"") -> bytes:
     return seal(HEADER.pack(VERSION, kind, sequence & 0xFFFF) + body)
 
 
-class FrameSplitter(StreamCutter):
-    """Cuts a byte stream into frames of this version and of known type."""
-
-    def __init__(self) -> None:
-        super().__init__(b"\0", LONGEST_FRAME)
-
-    def feed(self, data: bytes) -> list[tuple[int, Frame | None]]:
-        """Return (place of the first byte, frame); None for one that is damaged or not known."""
-        return [(place, _read(coded)) for place, coded in super().feed(data) if coded != b""]
+def cut_frames(kept: bytearray) -> list[Frame | None]:
+    """Take complete frames; None for one that is damaged, of another version or unknown type."""
+    return [_read(coded) for coded in cut_at(b"\0", LONGEST_FRAME, kept) if coded != b""]
 
 
 def _read(coded: bytes | None) -> Frame | None:
@@ -145,10 +139,8 @@ class NativeHost(HostProtocol):
     separator = b"\0"
     echoes = True
 
-    def __init__(self, chamber_count: int = 4) -> None:
-        super().__init__(chamber_count, FrameSplitter())
-        self._board_time: int | None = None
-        self._validity = VALIDITY
+    _validity = VALIDITY
+    _board_time: int | None
 
     def configure(self, settings: Settings) -> None:
         """Take over how long a command holds."""
@@ -169,6 +161,9 @@ class NativeHost(HostProtocol):
         """Encode VENT, which holds until the next SETPOINT."""
         sequence = self._next()
         return encode(FrameType.VENT, sequence), sequence
+
+    def _cut(self) -> list[Frame | None]:
+        return cut_frames(self._kept)
 
     def _interpret(self, frame: Frame) -> list[Event]:
         if frame.type is FrameType.IDENTITY:
