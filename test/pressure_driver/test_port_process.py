@@ -21,8 +21,9 @@ from pressure_driver import lines, port_process
 from pressure_driver.board import BoardProcess
 from pressure_driver.emulator.board import EmulatedBoard, Faults
 from pressure_driver.emulator.firmware import BOARDS
+from pressure_driver.emulator.line import emulated_line
 from pressure_driver.emulator.pneumatics import BoardPneumatics
-from pressure_driver.emulator.runner import BoardRunner, emulated_line
+from pressure_driver.emulator.runner import BoardRunner
 from pressure_driver.lines import Channel, open_line, tcp_address
 from pressure_driver.port_process import PortError, PortProcess, explain, stable_name
 from pressure_driver.protocols import NAMES
@@ -60,7 +61,7 @@ class Rig:
         self.runner = BoardRunner(self.board, self.port, on_command=self.commands.append)
         self.runner.start()
         self.settings = Settings(
-            port=str(self.port.link),
+            port=self.port.link,
             protocol=protocol,
             atmosphere=self.board.atmosphere,
             sensor_range=SENSOR_RANGE,
@@ -204,7 +205,7 @@ def test_vent_is_at_once_and_the_end_leaves_the_port(rig):
     wait_for(lambda: rig.vents()[-3:] == [True] * 3, "the last commands")
     rig.wait_vented()
     wait_for(lambda: not rig.port.host_present, "the port to be left")
-    open_line(str(rig.port.link), 115_200).close(drop=True)
+    open_line(rig.port.link, 115_200).close(drop=True)
 
 
 def test_by_hand_it_takes_lines_from_a_terminal(rig):
@@ -394,7 +395,7 @@ def test_ports_that_do_not_open_are_named_with_the_remedy(rig, tmp_path):
     file.write_text("text")
     for port, told in (
         (missing, f"no serial device {re.escape(missing)}.*ports that exist"),
-        (str(rig.port.link), r"in use by another program.*fuser"),
+        (rig.port.link, r"in use by another program.*fuser"),
         (str(file), "is no serial port"),
     ):
         with pytest.raises(SerialException) as raised:

@@ -18,8 +18,9 @@ from limb_interfaces.runner import run_node
 from limb_interfaces.stamps import stamp_from_nanoseconds
 from pressure_driver.emulator.board import EmulatedBoard, FaultError, Faults, ReceivedCommand
 from pressure_driver.emulator.firmware import BOARDS
+from pressure_driver.emulator.line import emulated_line
 from pressure_driver.emulator.pneumatics import BoardPneumatics
-from pressure_driver.emulator.runner import BoardRunner, emulated_line
+from pressure_driver.emulator.runner import BoardRunner
 from pressure_driver.node import read_settings
 from pressure_driver.protocols import order_of
 from pressure_driver.settings import EmulatorSettings
@@ -61,7 +62,7 @@ class BoardEmulator(Node):
         self._runner.set_faults(faults)
         self.add_on_set_parameters_callback(self._on_parameters)
         self._runner.start()
-        DiagnosticsPublisher(self, self._report, hardware_id=str(self._port.link))
+        DiagnosticsPublisher(self, self._report, hardware_id=self._port.link)
         self.create_timer(0.2, self._watch)
         self.get_logger().info(f"{settings.protocol} board on {self._port.link}")
 

@@ -19,7 +19,7 @@ from limb_interfaces import qos, topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
 from limb_interfaces.runner import run_node
 from pressure_driver.emulator.firmware import NativeBoard
-from pressure_driver.lines import BoardSocket
+from pressure_driver.emulator.line import BoardSocket
 from pressure_driver.node import read_settings
 from pressure_driver.settings import TopicBoardSettings
 from pressure_driver.topic_board import Scale, WatchedBoard
