@@ -366,12 +366,13 @@ def test_a_connection_that_ends_is_a_fault_and_the_next_one_vents(make_rigs):
 
 
 @pytest.mark.parametrize("reads", [True, False])
-def test_a_far_board_acknowledges_late_what_it_reads(reads):
+def test_a_far_board_acknowledges_late_what_it_reads(reads, monkeypatch):
+    monkeypatch.setattr(lines, "bytes_waiting", lambda _: 102)
     near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     with near, far:
         process = BoardProcess(Settings(real_time_priority=0), Channel(near), 1.0)
         lost = []
-        process._line, process._lose = SimpleNamespace(waiting=lambda: 102), lost.append
+        process._line, process._lose = SimpleNamespace(fileno=lambda: -1), lost.append
         for tick in range(40):
             process.core.clock = lambda tick=tick: tick / 20
             process._bytes_sent += 34 * reads
@@ -381,7 +382,7 @@ def test_a_far_board_acknowledges_late_what_it_reads(reads):
 
 def test_the_last_vent_command_may_be_acknowledged_late(monkeypatch):
     waiting = iter([102, 34, 0])
-    monkeypatch.setattr(lines, "_waiting", lambda _: next(waiting))
+    monkeypatch.setattr(lines, "bytes_waiting", lambda _: next(waiting))
     near, far = socket.socketpair()
     with near, far:
         assert lines.vent_line(near.fileno(), b"vent", 0.01) == ""

@@ -128,26 +128,18 @@ class Line:
             raise ConnectionResetError(errno.ECONNRESET, "the board has closed the connection")
         return b""
 
-    def write(self, data: bytes) -> int:
-        """Hand bytes to the operating system without waiting; return how many it has taken.
+    def write(self, data: bytes) -> None:
+        """Hand bytes to the operating system without waiting.
 
         Raises:
-            BlockingIOError: it takes none.
-            OSError: the board has gone, or a connection is full: half a frame cannot be taken back.
+            OSError: the board has gone, or does not read so that there is no room for them.
         """
-        # pyserial's own `write` waits for the terminal after each write.
-        count = os.write(self.fileno(), data)
-        if count < len(data) and not self.shared:
-            raise OSError(errno.ENOBUFS, "the connection takes no bytes")
-        return count
-
-    def waiting(self) -> int:
-        """Return how many bytes have not left, or over TCP have not been acknowledged."""
-        return _waiting(self.fileno())
-
-    def drop(self) -> None:
-        """Throw away what has not left; of a connection, the kernel gives nothing back."""
-        _flush(self.fileno())
+        count = 0
+        with contextlib.suppress(BlockingIOError):
+            # pyserial's own `write` waits for the terminal after each write.
+            count = os.write(self.fileno(), data)
+        if count < len(data):
+            raise OSError(errno.ENOBUFS, "it takes no bytes: the board does not read")
 
     def close(self, drop: bool) -> None:
         """Leave the line without waiting for the board.
@@ -160,7 +152,7 @@ class Line:
         """
         with contextlib.suppress(Exception):
             if drop and self.shared:
-                self.drop()
+                flush(self.fileno())
             elif drop:
                 now = struct.pack("ii", 1, 0)
                 self._device.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, now)
@@ -188,11 +180,6 @@ def tcp_address(port: str) -> tuple[str, int]:
         if found.hostname and found.port:
             return found.hostname, found.port
     raise OSError(errno.EINVAL, f"'{port}' is no address: write tcp://host:port")
-
-
-def may_open(port: str) -> bool:
-    """Return whether it is worth while to try to open a line: a serial port must have its file."""
-    return is_tcp(port) or os.path.exists(port)
 
 
 def open_line(port: str, baud_rate: int, patience: float = 0.0) -> Line:
@@ -231,15 +218,15 @@ def vent_line(descriptor: int, command: bytes, duration: float) -> str:
         return f"the board cannot be reached: {ADVICE}"
     taken, end = False, time.monotonic() + duration
     try:
-        _flush(descriptor)
+        flush(descriptor)
         while time.monotonic() < end:
             try:
                 taken = os.write(descriptor, command) == len(command)
             except BlockingIOError:
                 taken = False
-                _flush(descriptor)
+                flush(descriptor)
             time.sleep(VENT_PERIOD)
-        while (waiting := _waiting(descriptor)) and time.monotonic() < end + CONNECT_TIME:
+        while (waiting := bytes_waiting(descriptor)) and time.monotonic() < end + CONNECT_TIME:
             time.sleep(VENT_PERIOD)
     except (OSError, termios.error) as error:
         return f"the port is gone ({error}): {ADVICE}"
@@ -269,13 +256,13 @@ def release_descriptor(descriptor: int) -> None:
         os.close(descriptor)
 
 
-def _flush(descriptor: int) -> None:
-    """Throw away what is in the output queue of a terminal; a connection has none to throw away."""
+def flush(descriptor: int) -> None:
+    """Throw away what is in the output queue of a terminal; a connection gives nothing back."""
     with contextlib.suppress(termios.error):
         termios.tcflush(descriptor, termios.TCOFLUSH)
 
 
-def _waiting(descriptor: int) -> int:
+def bytes_waiting(descriptor: int) -> int:
     """Return how many bytes have not left a terminal, or have not been acknowledged over TCP."""
     (waiting,) = struct.unpack("i", fcntl.ioctl(descriptor, termios.TIOCOUTQ, bytes(4)))
     return int(waiting)
