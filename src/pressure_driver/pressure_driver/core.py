@@ -59,8 +59,7 @@ class BoardWatch:
         self._greeted_at = 0.0
 
     def opened(self, now: float) -> None:
-        """The port has been opened, and the board greeted: nothing is known about it."""
-        self.identity = None
+        """The port has been opened, and the board greeted."""
         self._unanswered.clear()
         self._greeted_at = now
 
@@ -70,9 +69,7 @@ class BoardWatch:
 
     def greeting(self, now: float) -> bytes:
         """Return the greeting again while it has not been answered; a board may boot slowly."""
-        unknown = self._protocol.introduces_itself and self.identity is None
-        answered = not (self._protocol.unsettled or unknown)
-        if answered or now - self._greeted_at < IDENTITY_RETRY:
+        if not self._protocol.unsettled or now - self._greeted_at < IDENTITY_RETRY:
             return b""
         self._greeted_at = now
         return self._protocol.start()
@@ -97,17 +94,15 @@ class BoardWatch:
         protocol, identity = self._protocol, self.identity
         wanted = self._settings.pressure_limit
         reach = min(protocol.reach, identity.largest_pressure if identity else wanted)
-        problem = ""
-        if protocol.introduces_itself and identity is None:
-            problem = "the board has not introduced itself yet"
-        elif identity and identity.chamber_count != protocol.chamber_count:
+        problem = protocol.unsettled
+        if identity and identity.chamber_count != protocol.chamber_count:
             problem = (
                 f"the board has {identity.chamber_count} chambers, the driver expects "
                 f"{protocol.chamber_count}: set the parameter 'segment_count'"
             )
         elif reach < wanted:
             problem = f"the board reaches {reach:.0f} Pa: lower 'pressure_limit' ({wanted:.0f} Pa)"
-        if problem := problem or protocol.unsettled:
+        if problem:
             yield Condition(problem, lasting=False)
         waits_since = self._unanswered[0][1] if self._unanswered else now
         if protocol.echoes and now - waits_since > ECHO_TIMEOUT:
@@ -349,7 +344,6 @@ class DriverCore:
         """Greet a board that has been reset; what was being played must not be played on."""
         reason = f"the board has been reset: {reset.sign}"
         self._log(reason, True)
-        self.board.identity = None
         self.board.greet_now(now)
         self.monitor.forget()
         if self.machine.mode in LIVE:

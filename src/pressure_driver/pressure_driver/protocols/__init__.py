@@ -188,8 +188,6 @@ class HostProtocol(ProtocolEnd):
     """What the protocol cannot protect from; shown in the diagnostics."""
     reports_supply: ClassVar[bool] = False
     has_watchdog: ClassVar[bool] = False
-    introduces_itself: ClassVar[bool] = False
-    """Whether the board answers `start` with a `BoardIdentity`."""
     separator: ClassVar[bytes] = b"\n"
     """What makes the board drop or finish whatever was sent by halves."""
     echoes: ClassVar[bool] = False

@@ -43,6 +43,7 @@ VALIDITY = 250
 """[ms] for which a setpoint holds, where nothing else is said."""
 LONGEST_VALIDITY = 60_000
 """[ms] A setpoint may stay valid at most this long."""
+_UNKNOWN = "the board has not introduced itself yet"
 
 
 def crc16(data: bytes) -> int:
@@ -135,7 +136,6 @@ class NativeHost(HostProtocol):
     reports_supply = True
     tells_pascals = True
     has_watchdog = True
-    introduces_itself = True
     separator = b"\0"
     echoes = True
 
@@ -185,6 +185,7 @@ class NativeHost(HostProtocol):
         text = body[HELLO_BODY.size :]
         if len(text) != length or low > high:
             return []
+        self.unsettled = ""
         return [BoardIdentity(count, float(high), text.decode("ascii", "replace"))]
 
     def _status(self, body: bytes) -> list[Event]:
@@ -210,9 +211,11 @@ class NativeHost(HostProtocol):
         last, self._board_time = self._board_time, time
         if last is None or (time - last) & 0xFFFFFFFF < 0x80000000:
             return []
+        self.unsettled = _UNKNOWN
         return [BoardReset("its clock has gone back")]
 
     def reset(self) -> None:
-        """Forget a half-received frame, and the board's clock."""
+        """Forget a half-received frame, the board's clock and that it has introduced itself."""
         super().reset()
+        self.unsettled = _UNKNOWN
         self._board_time = None
