@@ -51,7 +51,7 @@ def connected(
     def tell(command: Sequence[float]) -> None:
         nonlocal ticks
         data = host.start() if host.unsettled or not ticks else b""
-        data += host.setpoint(chamber_gauge(command))[0]
+        data += host.setpoint(chamber_gauge(command))
         while data:
             _, answer = board.receive(data, 0)
             host.decode(answer)

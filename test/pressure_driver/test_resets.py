@@ -100,7 +100,7 @@ def test_echoes_and_warnings_of_a_ctrlp_board_are_no_reset():
     reading = BoardReading(0.0, (101_325.0,) * 4, 101_325.0, (0.0,) * 4, 0.0)
     answers = b"".join(
         board.reply(command, reading)
-        for command in board.decode(host.start() * 2 + host.setpoint([1e3, 0.0, 0.0, 0.0])[0])
+        for command in board.decode(host.start() * 2 + host.setpoint([1e3, 0.0, 0.0, 0.0]))
     )
     events = host.decode(answers + b"_UNREC: Unrecognized Command\n")
     assert not [e for e in events if isinstance(e, BoardReset)]

@@ -54,25 +54,25 @@ def test_setpoints_are_passed_on_and_readings_come_back():
     bench = Bench()
     (identity,) = bench.say(bench.host.start(), 0.0)
     assert isinstance(identity, BoardIdentity)
-    data, number = bench.host.setpoint([7_000.0, 0.0, 0.0, 3_000.0])
+    data = bench.host.setpoint([7_000.0, 0.0, 0.0, 3_000.0])
     assert bench.say(data, 1.0) == [], "nothing has been measured"
     assert bench.told == [READING]
     telemetry, echo = bench.host.decode(bench.board.measured(READING, 1.1))
     assert telemetry == Telemetry(chamber_pressure=tuple(ROOM + value for value in READING))
-    assert echo == Echo(number)
+    assert echo == Echo(bench.host.number)
 
 
 def test_readings_that_stop_are_not_told_again():
     bench = Bench()
     bench.board.measured(READING, 1.0)
-    command = bench.host.vent()[0]
+    command = bench.host.vent()
     assert bench.say(command, 1.0 + 0.5 * STALE)
     assert bench.say(command, 1.0 + 1.5 * STALE) == []
 
 
 def test_it_vents_by_itself_when_setpoints_cease():
     bench = Bench()
-    bench.say(bench.host.setpoint([7_000.0, 0.0, 0.0, 3_000.0])[0], 1.0)
+    bench.say(bench.host.setpoint([7_000.0, 0.0, 0.0, 3_000.0]), 1.0)
     assert bench.board.look(1.25) == b""
     (failure,) = bench.host.decode(bench.board.look(1.26))
     assert isinstance(failure, BoardFailure)

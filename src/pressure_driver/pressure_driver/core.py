@@ -146,7 +146,6 @@ class DriverCore:
         self._texts: deque[str] = deque()
         self._last_tick = 0
         self._last_mode = Mode.DISARMED
-        self._pending_number: int | None = None
         self._clock_offset = 0.0
 
     def _conditions(self, now: float) -> Iterator[Condition]:
@@ -250,7 +249,7 @@ class DriverCore:
         self.monitor.forget()
         self._link_fault = ""
         self.board.opened(self.clock())
-        return self.protocol.start() + self._vent_bytes()
+        return self.protocol.start() + self.protocol.vent()
 
     def tick(self, instant: int) -> bytes:
         """Return the command of the tick at this wall time [ns]."""
@@ -263,28 +262,21 @@ class DriverCore:
         self.venting = vent or bool(self.protocol.unsettled)
         if self.venting:
             self.machine.command_nothing()
-            return self.board.greeting(now) + self._vent_bytes()
+            return self.board.greeting(now) + self.protocol.vent()
         asked = dict(zip(self._valves, chamber_gauge(self.machine.differential), strict=True))
-        data, self._pending_number = self.protocol.setpoint(
-            [asked[valve] for valve in sorted(asked)]
-        )
-        return data
+        return self.protocol.setpoint([asked[valve] for valve in sorted(asked)])
 
     def sent(self) -> None:
         """Do what can wait until the bytes of the tick are out."""
         now = self.clock()
         self.monitor.command(self.machine.differential, now)
-        self.board.has_sent(self._pending_number, now)
+        self.board.has_sent(self.protocol.number, now)
         self._note_mode()
         if self._texts:
             self._log(f"board: {self._texts.popleft()}", False)
 
     def _wire_atmosphere(self) -> float:
         return self.monitor.rest.mean if self.monitor.rest.known else STANDARD_ATMOSPHERE
-
-    def _vent_bytes(self) -> bytes:
-        data, self._pending_number = self.protocol.vent()
-        return data
 
     def _watch_wall_clock(self, instant: int) -> None:
         """Drop the schedule if the wall clock was set: its stamps do not mean what they meant."""

@@ -51,8 +51,8 @@ def test_registers_are_where_a_plain_server_has_them(plain_server):
     line = Line("tcp://{}:{}".format(*plain_server))
     events = []
     try:
-        data, number = host.setpoint([7_500.0, 0.0, 0.0, 20_000.0])
-        line.write(data)
+        line.write(host.setpoint([7_500.0, 0.0, 0.0, 20_000.0]))
+        number = host.number
 
         def answered():
             events.extend(host.decode(line.read()))

@@ -53,7 +53,7 @@ def reporting_board(name):
 def report(board, asker, reading=READING):
     """Return what a board says at one tick: a report, or the answers to what it is asked."""
     said = board.telemetry(reading)
-    data = b"" if said else asker.vent()[0]
+    data = b"" if said else asker.vent()
     while data:
         answer = b"".join(board.reply(command, reading) for command in board.decode(data))
         asker.decode(answer)
@@ -66,11 +66,8 @@ def report(board, asker, reading=READING):
 
 def test_ezloop_bytes():
     host = host_protocol("ezloop")
-    assert host.setpoint([7500.0, 0.0, 0.0, 20.0]) == (
-        b"<1088.25,1013.25,1013.25,1013.45>\n",
-        None,
-    )
-    assert host.vent()[0] == b"<1013.25,1013.25,1013.25,1013.25>\n"
+    assert host.setpoint([7500.0, 0.0, 0.0, 20.0]) == (b"<1088.25,1013.25,1013.25,1013.45>\n")
+    assert host.vent() == b"<1013.25,1013.25,1013.25,1013.25>\n"
     assert BOARDS["ezloop"]().telemetry(READING) == (
         b"[MPR]: 1019.00 1093.22 1018.50 1018.40\r\n"
         b"[RPR]: 1400.20\r\n[VAL]: 0.00 0.25 1.00 0.50\r\n"
@@ -79,8 +76,8 @@ def test_ezloop_bytes():
 
 def test_ctrlp_bytes():
     host = host_protocol("ctrlp")
-    assert host.setpoint([7500.0, 0.0, 0.0, 20.0])[0] == (b"SET;0.050;7.500;0.000;0.000;0.020\n")
-    assert host.vent()[0] == b"SET;0.000;0.000;0.000;0.000;0.000\n"
+    assert host.setpoint([7500.0, 0.0, 0.0, 20.0]) == (b"SET;0.050;7.500;0.000;0.000;0.020\n")
+    assert host.vent() == b"SET;0.000;0.000;0.000;0.000;0.000\n"
     assert reporting_board("ctrlp").telemetry(READING) == (
         b"12345\t0\t0.00\t0.00\t0.00\t0.00\r\n12345\t1\t0.09\t7.51\t0.04\t0.03\r\n"
     )
@@ -91,7 +88,7 @@ def test_a_pair_near_the_boards_limit_is_sent_lower_with_the_same_difference():
     for difference in (24_000.0, -24_000.0, 30_000.0):
         host = host_protocol("ezloop")
         host.room = lambda: 102_900.0
-        data, _ = host.setpoint(chamber_gauge([difference, 0.0]))
+        data = host.setpoint(chamber_gauge([difference, 0.0]))
         (command,) = board.decode(data)
         assert max(command.pressure) <= 125_000.0
         assert command.pressure[0] - command.pressure[1] == pytest.approx(difference, abs=1.0)
@@ -113,7 +110,7 @@ def test_commands_arrive_as_they_were_meant(name, split):
     generator = np.random.default_rng(3) if split else None
     host, board = host_protocol(name), BOARDS[name]()
     wanted = np.random.default_rng(4).uniform(-24_000.0, 24_000.0, (60, 2))
-    stream = host.start() + b"".join(host.setpoint(chamber_gauge(u))[0] for u in wanted)
+    stream = host.start() + b"".join(host.setpoint(chamber_gauge(u)) for u in wanted)
     commands = [c for c in decode_all(board, stream, generator) if c.kind == "setpoint"]
     assert len(commands) == len(wanted)
     for command, difference in zip(commands, wanted, strict=True):
@@ -146,7 +143,7 @@ def test_telemetry_arrives_as_it_was_measured(name, split):
 
 def test_a_native_board_refuses_more_than_it_reaches():
     host, board = host_protocol("native"), NativeBoard(4, 30_000)
-    (command,) = board.decode(host.setpoint([31_000.0, 0.0, 0.0, 0.0])[0])
+    (command,) = board.decode(host.setpoint([31_000.0, 0.0, 0.0, 0.0]))
     assert command.kind == "refused"
     (report,) = host.decode(board.reply(command, READING))
     assert report == BoardText("refused: pressure out of range")

@@ -146,7 +146,6 @@ class NativeBoard(BoardProtocol):
         super().__init__(chamber_count)
         self._known = known
         self._largest = largest_pressure
-        self._sequence = 0
 
     def _cut(self) -> list[Frame | None]:
         return cut_frames(self._kept)
@@ -169,10 +168,6 @@ class NativeBoard(BoardProtocol):
             return [BoardCommand("refused", sequence=number, text="pressure out of range")]
         pressure = tuple(float(value) for value in values)
         return [BoardCommand("setpoint", pressure, milliseconds / 1000.0, number)]
-
-    def _next(self) -> int:
-        self._sequence = (self._sequence + 1) & 0xFFFF
-        return self._sequence
 
     def telemetry(self, reading: BoardReading) -> bytes:
         """One STATUS frame."""

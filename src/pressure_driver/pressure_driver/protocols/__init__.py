@@ -156,6 +156,8 @@ class ProtocolEnd(ABC):
         """Frames or lines that were damaged, and places at which bytes had to be skipped."""
         self._kept = bytearray()
         """Bytes of what is not complete yet."""
+        self.number: int | None = None
+        """Of the newest frame to the other end; None where frames have no numbers."""
 
     def configure(self, settings: Any) -> None:  # noqa: B027 - most boards have no parameters
         """Take over the parameters that are for this board alone."""
@@ -169,6 +171,11 @@ class ProtocolEnd(ABC):
             self.rejected += not found
             said += found
         return said
+
+    def _next(self) -> int:
+        """Return the number of the next frame, modulo 65536."""
+        self.number = ((self.number or 0) + 1) & 0xFFFF
+        return self.number
 
     @abstractmethod
     def _cut(self) -> Iterable[Any]:
@@ -213,7 +220,6 @@ class HostProtocol(ProtocolEnd):
         self.unsettled = ""
         """Why no pressure may be commanded yet, though the board talks; empty if it may."""
         self._follow_up = b""
-        self._number = 0
         self.reset()
 
     def doubt(self) -> None:
@@ -224,17 +230,14 @@ class HostProtocol(ProtocolEnd):
         """Return what a board must be sent after the port has opened."""
 
     @abstractmethod
-    def setpoint(self, gauge: Sequence[float]) -> tuple[bytes, int | None]:
+    def setpoint(self, gauge: Sequence[float]) -> bytes:
         """Encode one command.
 
         Args:
             gauge: (2M,) [Pa] of each valve, within the driver's limits.
-
-        Returns:
-            The bytes, and the number that the board's echo will carry (None: it has no numbers).
         """
 
-    def vent(self) -> tuple[bytes, int | None]:
+    def vent(self) -> bytes:
         """Encode the command that opens every chamber to the atmosphere, or regulates to it."""
         return self.setpoint([0.0] * self.chamber_count)
 
@@ -243,12 +246,7 @@ class HostProtocol(ProtocolEnd):
 
         It is complete after any half-sent bytes.
         """
-        return self.separator + self.vent()[0]
-
-    def _next(self) -> int:
-        """Return the number of the next frame, modulo 65536, for protocols that have numbers."""
-        self._number = (self._number + 1) & 0xFFFF
-        return self._number
+        return self.separator + self.vent()
 
     def follow_up(self) -> bytes:
         """Return what is to be sent at once because of what has been decoded."""

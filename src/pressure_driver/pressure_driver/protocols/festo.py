@@ -171,11 +171,11 @@ class FestoHost(HostProtocol):
             self._acknowledging = self._motion_terminal
         return b""
 
-    def setpoint(self, gauge: Sequence[float]) -> tuple[bytes, int | None]:
+    def setpoint(self, gauge: Sequence[float]) -> bytes:
         """Encode one write of all setpoints to 1 mbar; its answer brings the question."""
         millibar = (round(value / PASCAL_PER_MILLIBAR) for value in gauge)
         values = [min(max(value, 0), LARGEST_SETPOINT) for value in millibar]
-        return self._write(values, self._acknowledging), self._number
+        return self._write(values, self._acknowledging)
 
     def emergency(self) -> bytes:
         """Regulate to the room's pressure, also where slots are being acknowledged."""

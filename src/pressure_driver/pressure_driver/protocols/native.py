@@ -150,17 +150,15 @@ class NativeHost(HostProtocol):
         """A zero byte, which ends whatever was half-sent, and HELLO."""
         return b"\0" + encode(FrameType.HELLO, self._next())
 
-    def setpoint(self, gauge: Sequence[float]) -> tuple[bytes, int | None]:
+    def setpoint(self, gauge: Sequence[float]) -> bytes:
         """Encode one gauge pressure a chamber, and how long they hold."""
         body = SETPOINT_HEAD.pack(self._validity)
         body += struct.pack(f"<{len(gauge)}i", *map(round, gauge))
-        sequence = self._next()
-        return encode(FrameType.SETPOINT, sequence, body), sequence
+        return encode(FrameType.SETPOINT, self._next(), body)
 
-    def vent(self) -> tuple[bytes, int | None]:
+    def vent(self) -> bytes:
         """Encode VENT, which holds until the next SETPOINT."""
-        sequence = self._next()
-        return encode(FrameType.VENT, sequence), sequence
+        return encode(FrameType.VENT, self._next())
 
     def _cut(self) -> list[Frame | None]:
         return cut_frames(self._kept)

@@ -89,9 +89,9 @@ class PneudriveHost(PneudriveEnd, HostProtocol):
         """Nothing: the board speaks when it is spoken to."""
         return b""
 
-    def setpoint(self, gauge: Sequence[float]) -> tuple[bytes, int | None]:
+    def setpoint(self, gauge: Sequence[float]) -> bytes:
         """Encode the targets."""
-        return self.encode(gauge), None
+        return self.encode(gauge)
 
     def _interpret(self, gauge: tuple[float, ...]) -> list[Event]:
         """Return what was measured, and that a command was answered."""
