@@ -53,7 +53,7 @@ def connected(
         data = host.start() if host.unsettled or not ticks else b""
         data += host.setpoint(chamber_gauge(command))
         while data:
-            _, answer = board.receive(data, 0)
+            _, answer = board.receive(data)
             host.decode(answer)
             data = host.follow_up()
         ticks += 1

@@ -26,7 +26,7 @@ class Simulation:
     """Ticks, line and air, one period at a time.
 
     Attributes worth a look: ``core``, ``board``, ``air`` (true gauge pressures), ``sent`` (bytes of
-    every tick), ``received`` (commands as the board saw them), ``plugged``.
+    every tick), ``received`` (time and pressures of commands, as the board saw them), ``plugged``.
     """
 
     def __init__(self, protocol="ezloop", seed=0, **settings):
@@ -113,8 +113,8 @@ class Simulation:
 
     def _receive(self, data):
         while data and self.plugged:
-            commands, answer = self.board.receive(data, self.wall)
-            self.received += commands
+            commands, answer = self.board.receive(data)
+            self.received += [(self.wall, pressure) for pressure in commands]
             data = self.core.received(answer) if answer else b""
 
     def tick(self):

@@ -58,7 +58,7 @@ class Rig:
         firmware = BOARDS[protocol]()
         firmware.configure(EmulatorSettings(sensor_range=SENSOR_RANGE))
         self.board = EmulatedBoard(firmware, air, 1)
-        self.runner = BoardRunner(self.board, self.port, on_command=self.commands.append)
+        self.runner = BoardRunner(self.board, self.port, on_command=self.note)
         self.runner.start()
         self.settings = Settings(
             port=self.port.link,
@@ -70,6 +70,9 @@ class Rig:
             hold_time=0.2,
         )
         self.said, self.state, self.armings = [], {}, 0
+
+    def note(self, _, pressure):
+        self.commands.append(pressure)
 
     def start(self):
         """Have the node's end of the driver in this process, and the port's in one of its own."""
@@ -110,7 +113,7 @@ class Rig:
 
     def vents(self, since=0):
         """Tell for each command since one of them whether it asks for equal pressures."""
-        pairs = [list(c.pressure) for c in list(self.commands)[since:]]
+        pairs = list(self.commands)[since:]
         return [max(abs(p[0] - p[1]), abs(p[2] - p[3])) < 1.0 for p in pairs]
 
     def wait_vented(self):

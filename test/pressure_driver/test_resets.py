@@ -26,7 +26,7 @@ def test_a_reset_of_the_board_is_a_fault_and_does_not_refill_the_limb(simulate, 
     sim.stream(4.0)
     assert sim.mode is Mode.FAULT
     assert all(
-        np.ptp(np.reshape(c.pressure, (-1, 2)), axis=1).max() < 1.0 for c in sim.received[received:]
+        np.ptp(np.reshape(p, (-1, 2)), axis=1).max() < 1.0 for _, p in sim.received[received:]
     )
     assert sim.vented
     if protocol == "ezloop":

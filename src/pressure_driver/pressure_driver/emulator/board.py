@@ -108,16 +108,6 @@ class Faults:
         return damaged.tobytes()
 
 
-@dataclass(frozen=True)
-class ReceivedCommand:
-    """A command as the board saw it on the wire."""
-
-    stamp: int
-    """[ns] arrival of the bytes that it came with: a driver writes a command at once."""
-    pressure: tuple[float, ...]
-    """(2M,) [Pa] absolute, decoded from the wire."""
-
-
 class EmulatedBoard:
     """Regulates the chambers of a `BoardPneumatics` as commanded over the wire.
 
@@ -167,29 +157,26 @@ class EmulatedBoard:
         air.supply_pressure = faults.supply
         self._apply()
 
-    def receive(self, data: bytes, stamp: int) -> tuple[list[ReceivedCommand], bytes]:
+    def receive(self, data: bytes) -> tuple[list[tuple[float, ...]], bytes]:
         """Take bytes from the host.
 
-        Args:
-            data: as they come.
-            stamp: [ns] arrival of the first of them, which a command in them is taken to begin at.
-
         Returns:
-            The commands that became complete, and what the board answers.
+            Pressures (2M,) [Pa], absolute, of each command that became complete, and what the board
+            answers.
         """
         if self._dead_for > 0.0:
             return [], b""
         if self.faults.drop > 0.0 and self._generator.random() < self.faults.drop:
             return [], b""
         data = self.faults.damage(data, self._generator)
-        received: list[ReceivedCommand] = []
+        received: list[tuple[float, ...]] = []
         answer = b""
         for command in self.protocol.decode(data):
             if self.faults.deaf and command.kind != "read":
                 continue
             answer += self._execute(command)
             if command.kind in ("setpoint", "vent"):
-                received.append(ReceivedCommand(stamp, self._wire_pressure(command)))
+                received.append(self._wire_pressure(command))
         if self.faults.mute:
             answer = b""
         return received, self.faults.damage(answer, self._generator)

@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from pressure_driver.emulator.board import EmulatedBoard, Faults, ReceivedCommand
+from pressure_driver.emulator.board import EmulatedBoard, Faults
 from pressure_driver.emulator.line import BoardLine
 from pressure_driver.lines import prefer_thread
 from pressure_driver.schedule import NANOSECONDS
@@ -33,7 +33,8 @@ class BoardRunner:
         board: firmware and air.
         port: the line.
         on_air: takes the wall time [ns] and the true chamber pressures (2M,) [Pa], at 50 Hz.
-        on_command: takes each command that the board has received.
+        on_command: takes the wall time [ns] at which a command has come, and its pressures (2M,)
+            [Pa], absolute.
         real_time_priority: SCHED_FIFO priority, 0 for none.
         reset_on_open: a host that opens the port restarts the board, as on boards whose reset is
             wired to DTR.
@@ -44,7 +45,7 @@ class BoardRunner:
         board: EmulatedBoard,
         port: BoardLine,
         on_air: Callable[[int, NDArray[np.float64]], None] = lambda *_: None,
-        on_command: Callable[[ReceivedCommand], None] = lambda *_: None,
+        on_command: Callable[[int, tuple[float, ...]], None] = lambda *_: None,
         real_time_priority: int = 0,
         reset_on_open: bool = True,
     ) -> None:
@@ -116,11 +117,10 @@ class BoardRunner:
         if self.port.read(now) and self._reset_on_open:
             self.port.send(self.board.boot())
         for stamp, data in self.port.arrived(now):
-            commands, answer = self.board.receive(data, stamp)
-            if answer:
-                self.port.send(answer)
-            for command in commands:
-                self._on_command(command)
+            commands, answer = self.board.receive(data)
+            self.port.send(answer)
+            for pressure in commands:
+                self._on_command(stamp, pressure)
         self.port.pump(now)
 
     def _apply(self, faults: Faults, now: int) -> None:
