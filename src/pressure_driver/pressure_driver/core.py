@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 LARGEST_CLOCK_STEP = 0.3
 """[s] between two ticks, above slewing and late wakes, that means the wall clock was set."""
 MOST_TEXTS = 20
-"""Texts of the board that wait to be logged, one a tick; more are only counted."""
+"""Texts of the board that wait to be logged, one a tick; of more, the newest."""
 IDENTITY_RETRY = 1.0
 """[s] after which a board that has not introduced or set itself up is greeted again."""
 ECHO_TIMEOUT = 1.0
@@ -130,8 +130,6 @@ class DriverCore:
         protocol.assumed_atmosphere = settings.atmosphere or STANDARD_ATMOSPHERE
         self.venting = True
         """Whether the bytes of the last tick were the vent command."""
-        self.unlogged_texts = 0
-        """Texts of the board that came too fast for the log."""
         self.last_text = ""
         """What the board has said last in plain words."""
         self.clock = RunningClock(2.0 / settings.rate, steady)
@@ -143,7 +141,7 @@ class DriverCore:
         self._valves = order_of(settings.wiring, protocol.chamber_count)
         self._log = log
         self._link_fault = "the serial port is not open"
-        self._texts: deque[str] = deque()
+        self._texts: deque[str] = deque(maxlen=MOST_TEXTS)
         self._last_tick = 0
         self._last_mode = Mode.DISARMED
         self._clock_offset = 0.0
@@ -238,7 +236,6 @@ class DriverCore:
             "damaged_frames": self.protocol.rejected,
             "last_damaged_line": self.protocol.last_damaged,
             "ticks_held_back_by_slew_limit": machine.limited_ticks,
-            "board_texts_not_logged": self.unlogged_texts,
         }
 
     # ----------------------------------------------------------------------- to the board
@@ -318,7 +315,7 @@ class DriverCore:
         elif isinstance(event, Echo):
             self.board.take_echo(event, now)
         elif isinstance(event, BoardFailure):
-            self._log_text(event.text)
+            self._texts.append(event.text)
             self.machine.fail(f"board reports {event.text}")
         elif isinstance(event, BoardReset):
             self._set_up_anew(event, now)
@@ -326,7 +323,7 @@ class DriverCore:
             self.board.identity = event
         elif isinstance(event, BoardText):
             self.last_text = event.text
-            self._log_text(event.text)
+            self._texts.append(event.text)
 
     def _of_chambers(self, told: tuple[float, ...] | None) -> tuple[float, ...] | None:
         """Return what a board tells of its valves in the order of the limb's chambers."""
@@ -342,13 +339,6 @@ class DriverCore:
             self.machine.fail(reason)
 
     # -------------------------------------------------------------------------- to the log
-
-    def _log_text(self, text: str) -> None:
-        """Keep what the board says for the log, unless it talks too much."""
-        if len(self._texts) < MOST_TEXTS:
-            self._texts.append(text)
-        else:
-            self.unlogged_texts += 1
 
     def _note_mode(self) -> None:
         mode = self.machine.mode
