@@ -28,14 +28,10 @@ PASCAL_PER_HECTOPASCAL = 100.0
 CMD_U_T = "cmd_u_t"
 LIFE_PERIOD = 0.1
 """[s] between two signs of life to the port's process."""
-MOST_LINES = 20
-"""Lines of the log that one callback writes: whatever else waits has its turn in between."""
 CALLS = QoSProfile(depth=1000)
 """Of `arm` and `vent`: the middleware's depth of 10 loses requests that come at once."""
 STATE_FIELDS = set(PressureState.get_fields_and_field_types()) - {"header", "setpoint_stamp"}
 """Of the message, by the names of the state; what else the state has is for the diagnostics."""
-LONGEST_NAME = 100
-"""Characters of the source of a lease that are kept."""
 LATE_TICKS = 1200
 """Ticks over which it is told how late their bytes are written: a minute."""
 
@@ -121,7 +117,7 @@ class PressureDriver(Node):
         self._offer((0, differential, "", 0, 0), CMD_U_T, info)
 
     def _on_lease(self, message: OperatorLease) -> None:
-        self._port.send("lease", message.source[:LONGEST_NAME], message.period)
+        self._port.send("lease", message.source, message.period)
 
     def _offer(self, setpoint: tuple[object, ...], topic: str, info: dict[str, int]) -> None:
         alone = self.count_publishers(topic) <= 1
@@ -151,7 +147,7 @@ class PressureDriver(Node):
             self._state_publisher.publish(message)
 
     def _write_log(self) -> None:
-        for _ in range(min(len(self._port.log), MOST_LINES)):
+        for _ in range(len(self._port.log)):
             text, warning = self._port.log.popleft()
             # Two calls in two lines: rclpy remembers one severity for each place in the code.
             if warning:
