@@ -14,7 +14,7 @@ from pressure_driver.protocols import (
     host_protocol,
 )
 from pressure_driver.settings import TopicBoardSettings
-from pressure_driver.topic_board import STALE, Scale, WatchedBoard
+from pressure_driver.topic_board import STALE, WatchedBoard, from_topic, to_topic
 
 ROOM = 101_325.0
 READING = (7_000.0, 0.0, 0.0, 3_000.0)
@@ -33,16 +33,16 @@ class Bench:
 
 
 def test_the_topics_have_their_own_unit_and_zero():
-    scale = Scale(TopicBoardSettings(scale=0.01, offset=1013.25))
-    told = scale.to_topic((100.0, 200.0, 300.0, 400.0))
+    settings = TopicBoardSettings(scale=0.01, offset=1013.25)
+    told = to_topic((100.0, 200.0, 300.0, 400.0), settings)
     assert told == pytest.approx([1014.25, 1015.25, 1016.25, 1017.25])
-    assert scale.from_topic(told) == pytest.approx([100.0, 200.0, 300.0, 400.0])
+    assert from_topic(told, settings) == pytest.approx([100.0, 200.0, 300.0, 400.0])
 
 
 @pytest.mark.parametrize("told", [(0.0, 0.0, 0.0), (0.0, 0.0, 0.0, math.nan)])
 def test_readings_that_are_not_a_number_for_each_chamber_are_refused(told):
     with pytest.raises(ValueError, match="4 numbers are expected"):
-        Scale(TopicBoardSettings()).from_topic(told)
+        from_topic(told, TopicBoardSettings())
 
 
 def test_one_topic_for_the_pressures_of_each_chamber_is_refused():
