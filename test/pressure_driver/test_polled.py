@@ -105,7 +105,7 @@ def test_a_terminal_with_regulators_is_played(simulate):
     assert sim.gauge[0] > 2_000.0
     first, words = told(sim.sent[-1])
     assert (first, len(words)) == (40003, 4)
-    assert all(festo.signed(word) >= 0 for word in words)
+    assert all(word >= 0 for word in words)
 
 
 def test_a_diagnosis_of_a_regulator_is_a_failure():

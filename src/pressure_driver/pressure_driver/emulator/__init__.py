@@ -47,6 +47,10 @@ class BoardProtocol(ProtocolEnd):
     gauge: ClassVar[bool] = False
     """Whether the wire carries pressures above the atmosphere; else the differences of pairs."""
 
+    def __init__(self, chamber_count: int = 4) -> None:
+        super().__init__(chamber_count)
+        self.boot(0.0)
+
     def boot(self, atmosphere: float) -> bytes:  # noqa: ARG002 - most boards say nothing
         """Return what the board says after power-up."""
         return b""

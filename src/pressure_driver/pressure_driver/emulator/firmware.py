@@ -69,10 +69,6 @@ class CtrlpBoard(BoardProtocol):
 
     gauge = True
 
-    def __init__(self, chamber_count: int = 4) -> None:
-        super().__init__(chamber_count)
-        self.boot(0.0)
-
     def boot(self, atmosphere: float) -> bytes:  # noqa: ARG002 - it measures gauge pressure
         """Reports are off until asked for, and pressures are in psi."""
         self._unit = "psi"

@@ -31,7 +31,7 @@ class Slot:
 
     def tell(self, word: int) -> None:
         """Take over the first register of the slot."""
-        mode, control = word & 0x3F, word >> 6
+        mode, control = word & 0x3F, word >> 6 & 3
         if mode in (festo.ACKNOWLEDGE, festo.INACTIVE):
             self.mode, self.state = festo.INACTIVE, TO_BE_CONFIGURED
         elif (mode, control, self.mode) == (festo.REGULATE, festo.BOTH_VALVES, festo.INACTIVE):
@@ -49,10 +49,6 @@ class FestoBoard(BoardProtocol):
 
     gauge = True
     _motion_terminal = True
-
-    def __init__(self, chamber_count: int = 4) -> None:
-        super().__init__(chamber_count)
-        self.boot(0.0)
 
     def configure(self, settings: EmulatorSettings) -> None:
         """Take over which valves the terminal has."""
@@ -88,11 +84,10 @@ class FestoBoard(BoardProtocol):
 
     def _setpoints(self) -> tuple[float, ...]:
         values = [v for place, v in enumerate(self._outputs) if place % 3 or not self.slots]
-        millibar = (festo.signed(value) for value in values)
         # Regulators of an MPA terminal that are told less than nothing open wide.
         wild = 0 if self.slots else festo.LARGEST_SETPOINT
         return tuple(
-            festo.PASCAL_PER_MILLIBAR * (value if value >= 0 else wild) for value in millibar
+            festo.PASCAL_PER_MILLIBAR * (value if value >= 0 else wild) for value in values
         )
 
     def target(self, pressure: Sequence[float], time: float) -> Sequence[float]:

@@ -91,13 +91,8 @@ def to_bytes(words: Iterable[int]) -> bytes:
 
 
 def to_words(data: bytes) -> tuple[int, ...]:
-    """Return registers, 0 … 65535; half a register at the end is left out."""
-    return struct.unpack_from(f">{len(data) // 2}H", data)
-
-
-def signed(word: int) -> int:
-    """Return a register as a number of 16 bits with sign."""
-    return word - 0x10000 if word & 0x8000 else word
+    """Return registers as numbers with sign; half a register at the end is left out."""
+    return struct.unpack_from(f">{len(data) // 2}h", data)
 
 
 def cut_frames(kept: bytearray) -> Iterator[ModbusFrame | None]:
@@ -228,7 +223,7 @@ class FestoHost(HostProtocol):
             if (mode, state) != (REGULATE, RUNNING):
                 problem = problem or (
                     f"slot {slot} does not run: mode {mode}, state {state} ({STATES[state]}), "
-                    f"application {word >> 8}"
+                    f"application {word >> 8 & 0xFF}"
                 )
         pressures = [words[place] for place in range(len(words)) if place % INPUTS]
         return self._judge(problem, pressures)
@@ -247,6 +242,6 @@ class FestoHost(HostProtocol):
         if self._sound:
             self._acknowledging = False
             self._started_at = -math.inf  # whatever fails next is started again at once
-        gauge = (PASCAL_PER_MILLIBAR * signed(word) for word in pressures)
+        gauge = (PASCAL_PER_MILLIBAR * millibar for millibar in pressures)
         readings = tuple(self.assumed_atmosphere + value for value in gauge)
         return [*events, Telemetry(chamber_pressure=readings)]
