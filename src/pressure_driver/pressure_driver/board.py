@@ -131,16 +131,14 @@ class BoardProcess:
         """Wait for bytes, a message or the tick, and serve what came."""
         self._look_for_port()
         delay = min(max(self.grid.delay(time.time_ns()), 0.0), LONGEST_WAIT)
-        watched: list[Any] = [self._channel]
-        if self._bytes_waiting is not None:
-            watched.append(self._bytes_waiting)
+        watched = [each for each in (self._channel, self._bytes_waiting) if each is not None]
         readable, _, _ = select.select(watched, [], [], delay)
         instant = self.grid.take(time.time_ns())
         if instant is not None:
             self._tick(instant)
         if self._channel in readable:
             self._serve_messages()
-        if self._bytes_waiting is not None and self._bytes_waiting in readable:
+        if self._bytes_waiting in readable:
             self._read()
         self._show_life()
 

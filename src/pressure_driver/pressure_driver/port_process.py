@@ -159,6 +159,7 @@ class PortProcess:
             env={**os.environ, "PYTHONSAFEPATH": "1"},
         )
         far.close()
+        self.process_id = self._process.pid
         self._channel = Channel(near)
         near.settimeout(START_TIME)
         try:
@@ -172,11 +173,6 @@ class PortProcess:
         self._serve(message, descriptor)
         near.settimeout(LOOK)
         self._thread.start()
-
-    @property
-    def process_id(self) -> int:
-        """Of the process."""
-        return self._process.pid
 
     # ---------------------------------------------------------------------------- requests
 
