@@ -84,11 +84,7 @@ class FestoBoard(BoardProtocol):
 
     def _setpoints(self) -> tuple[float, ...]:
         values = [v for place, v in enumerate(self._outputs) if place % 3 or not self.slots]
-        # Regulators of an MPA terminal that are told less than nothing open wide.
-        wild = 0 if self.slots else festo.LARGEST_SETPOINT
-        return tuple(
-            festo.PASCAL_PER_MILLIBAR * (value if value >= 0 else wild) for value in values
-        )
+        return tuple(festo.PASCAL_PER_MILLIBAR * value for value in values)
 
     def target(self, pressure: Sequence[float], time: float) -> Sequence[float]:
         """Return setpoints of slots that run; the others are vented."""

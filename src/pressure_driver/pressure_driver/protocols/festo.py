@@ -144,9 +144,10 @@ class FestoHost(HostProtocol):
         """Forget a half-received frame and whether the valves run."""
         super().reset()
         self._follow_up = b""
-        self._sound = self._acknowledging = False
+        self._sound: bool | None = None
+        """Whether all valves ran at the last report; None before the first."""
+        self._acknowledging = False
         self._started_at = -math.inf
-        self._modes: set[int] = set()
         self.doubt()
 
     def doubt(self) -> None:
@@ -161,7 +162,7 @@ class FestoHost(HostProtocol):
         They are asked first: a terminal that runs already is vented and not started again.
         """
         now = self.clock()
-        if self._modes and not self._sound and now - self._started_at > START_TIME:
+        if self._sound is False and now - self._started_at > START_TIME:
             self._started_at = now
             self._acknowledging = self._motion_terminal
         return b""
@@ -214,8 +215,8 @@ class FestoHost(HostProtocol):
     def _slots(self, words: Sequence[int]) -> list[Event]:
         """Read slots of a motion terminal, and go on with their start."""
         status = words[0::INPUTS]
-        self._modes = {word & 0x3F for word in status}
-        if self._modes == {INACTIVE} and self.clock() - self._started_at >= ACKNOWLEDGE_TIME:
+        modes = {word & 0x3F for word in status}
+        if modes == {INACTIVE} and self.clock() - self._started_at >= ACKNOWLEDGE_TIME:
             self._acknowledging = False
         problem = ""
         for slot, word in enumerate(status):
@@ -230,7 +231,6 @@ class FestoHost(HostProtocol):
 
     def _regulators(self, words: Sequence[int]) -> list[Event]:
         """Read regulators of an MPA terminal."""
-        self._modes = {REGULATE}
         diagnoses = enumerate(words[2::INPUTS])
         found = [f"valve {valve} reports: diagnosis {code}" for valve, code in diagnoses if code]
         return self._judge("; ".join(found), words[0::INPUTS])
