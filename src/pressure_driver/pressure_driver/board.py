@@ -180,7 +180,9 @@ class BoardProcess:
         elif word == "vent":
             self._send("answer", *self._vent_now())
         elif word == "lease":
-            self._renew_lease(*content)
+            source, period = content
+            if problem := self.core.machine.leases.renew(source, period, self.core.clock()):
+                self._log(problem, True)
         elif word == "end":
             self.end()
 
@@ -190,11 +192,6 @@ class BoardProcess:
         if verdict is not Verdict.ACCEPTED and now - self._refused_at >= REFUSAL_PERIOD:
             self._refused_at = now
             self._log(f"{verdict.value}: {self.core.machine.schedule.reason}", True)
-
-    def _renew_lease(self, source: str, period: float) -> None:
-        core = self.core
-        if problem := core.machine.leases.renew(source, period, core.clock()):
-            self._log(problem, True)
 
     def _vent_now(self) -> tuple[bool, str]:
         """Vent before the next tick, and before all that waits to be sent."""
@@ -227,7 +224,7 @@ class BoardProcess:
         self._write(self.core.opening())
         if self._line is not None:
             descriptor = self._line.fileno() if self._line.shared else None
-            self._send("port", self.core.protocol.emergency().hex(), descriptor=descriptor)
+            self._send("port", descriptor=descriptor)
 
     def _look_for_port(self) -> None:
         """Open a port that was lost as soon as its name is there again."""

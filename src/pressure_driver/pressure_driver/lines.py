@@ -93,8 +93,7 @@ class Line:
         self._claim = socket.socket(socket.AF_UNIX)
         try:
             if self.shared:
-                options = {"timeout": 0, "write_timeout": 0.05, "exclusive": True}
-                self._device = serial.Serial(port, baud_rate, **options)
+                self._device = serial.Serial(port, baud_rate, timeout=0, exclusive=True)
                 with contextlib.suppress(OSError):
                     fcntl.ioctl(self._device.fileno(), termios.TIOCEXCL)
                 return

@@ -20,7 +20,6 @@ from limb_interfaces.parameters import ParameterError, check_overrides, declare
 from limb_interfaces.runner import run_node
 from limb_interfaces.stamps import nanoseconds, stamp_from_nanoseconds
 from pressure_driver.port_process import PortProcess
-from pressure_driver.protocols import host_protocol
 from pressure_driver.safety import Mode
 from pressure_driver.settings import Declared, Settings, declarations
 
@@ -70,7 +69,6 @@ class PressureDriver(Node):
                 "parameter 'use_sim_time' is true: the driver moves air in real time; leave it out"
             )
         settings = read_settings(self, Settings)
-        self._protocol = host_protocol(settings.protocol, 2 * settings.segment_count, settings)
         self._state: dict[str, Any] = {}
         self._late: deque[float] = deque(maxlen=LATE_TICKS)
         self._state_publisher = self.create_publisher(
@@ -157,7 +155,7 @@ class PressureDriver(Node):
 
     def _report(self) -> Health:
         """Tell what the state has beside the message, and how late ticks are."""
-        state, weaknesses = self._state, self._protocol.weaknesses
+        state, protocol = self._state, self._port.protocol
         if not state:
             return Health("stale", "starting")
         mode = Mode(state["mode"]).name
@@ -169,8 +167,8 @@ class PressureDriver(Node):
             "telemetry_age_s": _written(state["telemetry_age"]),
             "round_trip_s": _written(state["round_trip"]),
             "mode": mode,
-            "protocol": self._protocol.name,
-            "protocol_weaknesses": _written(weaknesses),
+            "protocol": protocol.name,
+            "protocol_weaknesses": _written(protocol.weaknesses),
             "port_process": self._port.process_id,
             **{
                 f"tick_to_write_{label}_ms": _written(late[round(share * (len(late) - 1))])
@@ -185,8 +183,8 @@ class PressureDriver(Node):
         if mode == "DISARMED" and state["obstacles_to_arming"]:
             level = "error" if math.isfinite(state["atmosphere_pa"]) else "stale"
             return Health(level, f"waiting for: {_written(state['obstacles_to_arming'])}", values)
-        if weaknesses:
-            return Health("warning", f"{mode}; {self._protocol.name}: {weaknesses[0]}", values)
+        if protocol.weaknesses:
+            return Health("warning", f"{mode}; {protocol.name}: {protocol.weaknesses[0]}", values)
         return Health("ok", mode, values)
 
     def close(self) -> None:
