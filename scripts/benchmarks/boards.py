@@ -41,7 +41,7 @@ def connected(
     name: str, air: BoardPneumatics, seed: int, fault: str = "", **parameters: float
 ) -> tuple[EmulatedBoard, Callable[[Sequence[float]], None]]:
     """Return a board, and what tells it a command (M,) [Pa], starting it where it does not run."""
-    host = host_protocol(name, 4, Settings(protocol=name, **parameters))
+    host = host_protocol(Settings(protocol=name, **parameters))
     firmware = BOARDS[name]()
     firmware.configure(EmulatorSettings(protocol=name, **parameters))
     board = EmulatedBoard(firmware, air, seed)

@@ -36,7 +36,7 @@ class Simulation:
         for name in {"terminal", "sensor_range"} & set(settings):
             shared[name] = settings.pop(name)
         self.settings = Settings(**shared, **settings)
-        host = host_protocol(protocol, 4, self.settings)
+        host = host_protocol(self.settings)
         self.core = DriverCore(host, self.settings, steady=lambda: self.steady)
         self._other_end = EmulatorSettings(**shared)
         self.board = EmulatedBoard(self.firmware(), BoardPneumatics(2, seed), seed)

@@ -12,6 +12,7 @@ from pressure_driver.emulator.firmware import BOARDS
 from pressure_driver.emulator.line import EmulatedPort
 from pressure_driver.emulator.pneumatics import BoardPneumatics
 from pressure_driver.protocols import host_protocol
+from pressure_driver.settings import Settings
 
 SEEDS = range(8)
 
@@ -95,7 +96,7 @@ def test_fault_texts():
 def test_dropped_and_corrupted_bytes_come_in_the_stated_share():
     board = EmulatedBoard(BOARDS["ezloop"](), BoardPneumatics(2), 0)
     board.set_faults(Faults.parse(["drop:0.3"], 4))
-    data = host_protocol("ezloop").vent()
+    data = host_protocol(Settings(protocol="ezloop")).vent()
     got = sum(len(board.receive(data)[0]) for _ in range(2000))
     assert got / 2000 == pytest.approx(0.7, abs=0.04)
     faults = Faults.parse(["corrupt:0.05"], 4)

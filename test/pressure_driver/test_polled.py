@@ -35,7 +35,7 @@ def told(data):
 
 
 def test_setpoints_of_a_motion_terminal_stand_behind_the_mode_of_their_slot():
-    host = host_protocol("festo")
+    host = host_protocol(Settings(protocol="festo"))
     data = host.setpoint([7_540.0, 0.0, 0.0, 20_000.0])
     assert told(data) == (40003, (0xC3, 75, 0, 0xC3, 0, 200))
     assert host.follow_up() == b""
@@ -48,7 +48,7 @@ def test_setpoints_of_a_motion_terminal_stand_behind_the_mode_of_their_slot():
 
 
 def test_slots_are_acknowledged_for_half_a_second_before_they_are_started():
-    host = host_protocol("festo")
+    host = host_protocol(Settings(protocol="festo"))
     clock = host.clock = Clock()
 
     def mode():
@@ -81,7 +81,7 @@ def test_slots_are_acknowledged_for_half_a_second_before_they_are_started():
 
 
 def test_a_slot_that_ceases_to_run_is_a_failure_once():
-    host = host_protocol("festo")
+    host = host_protocol(Settings(protocol="festo"))
     answer(host, RUNNING, 0, 0, RUNNING, 0, 0)
     events = answer(host, RUNNING, 0, 0, 9 << 8 | 3 << 6 | 3, 0, 0)
     assert events[0] == BoardFailure("slot 1 does not run: mode 3, state 3 (failed), application 9")
@@ -89,7 +89,7 @@ def test_a_slot_that_ceases_to_run_is_a_failure_once():
 
 
 def test_a_refusal_of_the_terminal_is_named():
-    host, board = host_protocol("festo", 8), FestoBoard(4)
+    host, board = host_protocol(Settings(protocol="festo", segment_count=4)), FestoBoard(4)
     commands = board.decode(host.vent())
     reading = BoardReading(0.0, (ROOM,) * 4, ROOM, (0.0,) * 4, 0.0)
     (event,) = host.decode(b"".join(board.reply(command, reading) for command in commands))
@@ -109,7 +109,7 @@ def test_a_terminal_with_regulators_is_played(simulate):
 
 
 def test_a_diagnosis_of_a_regulator_is_a_failure():
-    host = host_protocol("festo", 4, Settings(protocol="festo", terminal="mpa"))
+    host = host_protocol(Settings(protocol="festo", terminal="mpa"))
     answer(host, *(0, 0, 0) * 4)
     assert host.unsettled == ""
     failure, _ = answer(host, *(0, 0, 0) * 3, 0, 0, 5)
@@ -120,7 +120,7 @@ def test_a_diagnosis_of_a_regulator_is_a_failure():
 
 
 def test_frames_of_a_pneudrive_board():
-    host = host_protocol("pneudrive")
+    host = host_protocol(Settings(protocol="pneudrive"))
     data = host.setpoint([68_950.0, 0.0, 0.0, 0.0])
     assert data == bytes.fromhex("ffff 00b8 0066 0066 0066")
     assert host.setpoint([1e6, 0.0, 0.0, 0.0])[2:4] == (1023).to_bytes(2, "big")
@@ -133,7 +133,7 @@ def test_frames_of_a_pneudrive_board():
 
 
 def test_a_pneudrive_board_answers_to_its_own_number_alone():
-    host = host_protocol("pneudrive", 4, Settings(protocol="pneudrive", device=2))
+    host = host_protocol(Settings(protocol="pneudrive", device=2))
     data = host.setpoint([68_950.0, 0.0, 0.0, 0.0])
     assert data == bytes.fromhex("fffd 00b8 0066 0066 0066")
     board = PneudriveBoard(4)

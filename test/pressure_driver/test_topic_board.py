@@ -13,7 +13,7 @@ from pressure_driver.protocols import (
     Telemetry,
     host_protocol,
 )
-from pressure_driver.settings import TopicBoardSettings
+from pressure_driver.settings import Settings, TopicBoardSettings
 from pressure_driver.topic_board import STALE, WatchedBoard, from_topic, to_topic
 
 ROOM = 101_325.0
@@ -25,7 +25,7 @@ class Bench:
 
     def __init__(self):
         self.told = []
-        self.host = host_protocol("native")
+        self.host = host_protocol(Settings(protocol="native"))
         self.board = WatchedBoard(NativeBoard(4, 30_000, known=0), self.told.append)
 
     def say(self, data, now):

@@ -60,7 +60,7 @@ class BoardProcess:
     """
 
     def __init__(self, settings: Settings, channel: Channel, patience: float) -> None:
-        protocol = host_protocol(settings.protocol, 2 * settings.segment_count, settings)
+        protocol = host_protocol(settings)
         self.core = DriverCore(protocol, settings, log=self._log)
         self.grid = TickGrid(self.core.machine.schedule.period)
         self.ending = False

@@ -135,7 +135,7 @@ class PortProcess:
         self._settings = replace(settings, port=stable_name(settings.port))
         self._on_message = on_message
         self._answers: queue.Queue[tuple[bool, str]] = queue.Queue()
-        self.protocol = host_protocol(settings.protocol, 2 * settings.segment_count, settings)
+        self.protocol = host_protocol(settings)
         """What the board understands."""
         self._descriptor = -1
         self._outcome: str | None = None

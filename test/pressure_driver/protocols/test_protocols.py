@@ -17,6 +17,7 @@ from pressure_driver.protocols import (
     host_protocol,
 )
 from pressure_driver.protocols.native import FrameType, crc16, encode, seal, unseal
+from pressure_driver.settings import Settings
 
 ATMOSPHERE = 101_812.0
 READING = BoardReading(
@@ -46,7 +47,7 @@ def decode_all(decoder, stream, generator=None):
 def reporting_board(name):
     board = BOARDS[name]()
     board.boot(ATMOSPHERE)
-    board.decode(host_protocol(name).start())
+    board.decode(host_protocol(Settings(protocol=name)).start())
     return board
 
 
@@ -65,7 +66,7 @@ def report(board, asker, reading=READING):
 
 
 def test_ezloop_bytes():
-    host = host_protocol("ezloop")
+    host = host_protocol(Settings(protocol="ezloop"))
     assert host.setpoint([7500.0, 0.0, 0.0, 20.0]) == (b"<1088.25,1013.25,1013.25,1013.45>\n")
     assert host.vent() == b"<1013.25,1013.25,1013.25,1013.25>\n"
     assert BOARDS["ezloop"]().telemetry(READING) == (
@@ -75,7 +76,7 @@ def test_ezloop_bytes():
 
 
 def test_ctrlp_bytes():
-    host = host_protocol("ctrlp")
+    host = host_protocol(Settings(protocol="ctrlp"))
     assert host.setpoint([7500.0, 0.0, 0.0, 20.0]) == (b"SET;0.050;7.500;0.000;0.000;0.020\n")
     assert host.vent() == b"SET;0.000;0.000;0.000;0.000;0.000\n"
     assert reporting_board("ctrlp").telemetry(READING) == (
@@ -86,7 +87,7 @@ def test_ctrlp_bytes():
 def test_a_pair_near_the_boards_limit_is_sent_lower_with_the_same_difference():
     board = BOARDS["ezloop"]()
     for difference in (24_000.0, -24_000.0, 30_000.0):
-        host = host_protocol("ezloop")
+        host = host_protocol(Settings(protocol="ezloop"))
         host.room = lambda: 102_900.0
         data = host.setpoint(chamber_gauge([difference, 0.0]))
         (command,) = board.decode(data)
@@ -108,7 +109,7 @@ def test_the_ezloop_board_ignores_a_command_above_its_limit_whole():
 @pytest.mark.parametrize("split", [False, True])
 def test_commands_arrive_as_they_were_meant(name, split):
     generator = np.random.default_rng(3) if split else None
-    host, board = host_protocol(name), BOARDS[name]()
+    host, board = host_protocol(Settings(protocol=name)), BOARDS[name]()
     wanted = np.random.default_rng(4).uniform(-24_000.0, 24_000.0, (60, 2))
     stream = host.start() + b"".join(host.setpoint(chamber_gauge(u)) for u in wanted)
     commands = [c for c in decode_all(board, stream, generator) if c.kind == "setpoint"]
@@ -124,10 +125,12 @@ def test_commands_arrive_as_they_were_meant(name, split):
 @pytest.mark.parametrize("split", [False, True])
 def test_telemetry_arrives_as_it_was_measured(name, split):
     generator = np.random.default_rng(5) if split else None
-    host, board = host_protocol(name), reporting_board(name)
+    host, board = host_protocol(Settings(protocol=name)), reporting_board(name)
     host.assumed_atmosphere = ATMOSPHERE
     garbage = b"\x00noise\xff" + (b"\0" if name == "native" else b"\n")
-    events = decode_all(host, garbage + report(board, host_protocol(name)), generator)
+    events = decode_all(
+        host, garbage + report(board, host_protocol(Settings(protocol=name))), generator
+    )
     merged = {}
     for event in events:
         if isinstance(event, Telemetry):
@@ -142,7 +145,7 @@ def test_telemetry_arrives_as_it_was_measured(name, split):
 
 
 def test_a_native_board_refuses_more_than_it_reaches():
-    host, board = host_protocol("native"), NativeBoard(4, 30_000)
+    host, board = host_protocol(Settings(protocol="native")), NativeBoard(4, 30_000)
     (command,) = board.decode(host.setpoint([31_000.0, 0.0, 0.0, 0.0]))
     assert command.kind == "refused"
     (report,) = host.decode(board.reply(command, READING))
@@ -161,7 +164,7 @@ def test_native_board_refuses_malformed_setpoints(body):
 
 
 def test_frames_of_another_version_or_type_are_rejected():
-    host = host_protocol("native")
+    host = host_protocol(Settings(protocol="native"))
     assert host.decode(seal(bytes([2, FrameType.STATUS, 0, 0]))) == []
     assert host.decode(seal(bytes([1, 0x44, 0, 0]))) == []
     assert host.rejected == 2
@@ -210,7 +213,7 @@ def mutated(sound, seed):
 
 def board_stream(name):
     """What a board says in a while, with changing numbers."""
-    board, asker = reporting_board(name), host_protocol(name)
+    board, asker = reporting_board(name), host_protocol(Settings(protocol=name))
     generator = np.random.default_rng(6)
     stream = b""
     for step in range(200):
@@ -227,7 +230,7 @@ def board_stream(name):
 def test_a_million_bytes_into_the_hosts_decoder(name, kind):
     sound = board_stream(name)
     stream = random_bytes(8) if kind == "random" else mutated(sound, 9)
-    host = host_protocol(name)
+    host = host_protocol(Settings(protocol=name))
     events = decode_all(host, stream, np.random.default_rng(10))
     pressures = [
         e.chamber_pressure for e in events if isinstance(e, Telemetry) and e.chamber_pressure
@@ -235,7 +238,7 @@ def test_a_million_bytes_into_the_hosts_decoder(name, kind):
     if name == "native":
         truth = {
             e.chamber_pressure
-            for e in host_protocol(name).decode(sound)
+            for e in host_protocol(Settings(protocol=name)).decode(sound)
             if isinstance(e, Telemetry)
         }
         assert set(pressures) <= truth

@@ -276,13 +276,10 @@ class LineHost(HostProtocol):
         """Return what a line says; None: it is damaged."""
 
 
-def host_protocol(
-    name: str, chamber_count: int = 4, settings: Settings | None = None
-) -> HostProtocol:
-    """Return the driver's end of one of the `NAMES`; only its module is loaded."""
-    module = import_module(f"pressure_driver.protocols.{name}")
-    host: Callable[[int], HostProtocol] = getattr(module, f"{name.capitalize()}Host")
-    protocol = host(chamber_count)
-    if settings is not None:
-        protocol.configure(settings)
+def host_protocol(settings: Settings) -> HostProtocol:
+    """Return the driver's end of the language that is chosen; only its module is loaded."""
+    module = import_module(f"pressure_driver.protocols.{settings.protocol}")
+    host: type[HostProtocol] = getattr(module, f"{settings.protocol.capitalize()}Host")
+    protocol = host(2 * settings.segment_count)
+    protocol.configure(settings)
     return protocol

@@ -39,8 +39,6 @@ SETPOINT_HEAD = struct.Struct("<H")
 STATUS_HEAD = struct.Struct("<IHBII")
 LONGEST_FRAME = 256
 """[bytes] as coded; a longer one is garbage."""
-VALIDITY = 250
-"""[ms] for which a setpoint holds, where nothing else is said."""
 LONGEST_VALIDITY = 60_000
 """[ms] A setpoint may stay valid at most this long."""
 _UNKNOWN = "the board has not introduced itself yet"
@@ -139,7 +137,6 @@ class NativeHost(HostProtocol):
     separator = b"\0"
     echoes = True
 
-    _validity = VALIDITY
     _board_time: int | None
 
     def configure(self, settings: Settings) -> None:
