@@ -41,7 +41,7 @@ def connected(
     name: str, air: BoardPneumatics, seed: int, fault: str = "", **parameters: float
 ) -> tuple[EmulatedBoard, Callable[[Sequence[float]], None]]:
     """Return a board, and what tells it a command (M,) [Pa], starting it where it does not run."""
-    host = host_protocol(name, 4, Settings(protocol=name, **parameters))
+    host = host_protocol(Settings(protocol=name, **parameters))
     firmware = BOARDS[name]()
     firmware.configure(EmulatorSettings(protocol=name, **parameters))
     board = EmulatedBoard(firmware, air, seed)
@@ -51,9 +51,9 @@ def connected(
     def tell(command: Sequence[float]) -> None:
         nonlocal ticks
         data = host.start() if host.unsettled or not ticks else b""
-        data += host.setpoint(chamber_gauge(command))[0]
+        data += host.setpoint(chamber_gauge(command))
         while data:
-            _, answer = board.receive(data, 0)
+            _, answer = board.receive(data)
             host.decode(answer)
             data = host.follow_up()
         ticks += 1

@@ -26,7 +26,7 @@ class Simulation:
     """Ticks, line and air, one period at a time.
 
     Attributes worth a look: ``core``, ``board``, ``air`` (true gauge pressures), ``sent`` (bytes of
-    every tick), ``received`` (commands as the board saw them), ``plugged``.
+    every tick), ``received`` (time and pressures of commands, as the board saw them), ``plugged``.
     """
 
     def __init__(self, protocol="ezloop", seed=0, **settings):
@@ -36,7 +36,7 @@ class Simulation:
         for name in {"terminal", "sensor_range"} & set(settings):
             shared[name] = settings.pop(name)
         self.settings = Settings(**shared, **settings)
-        host = host_protocol(protocol, 4, self.settings)
+        host = host_protocol(self.settings)
         self.core = DriverCore(host, self.settings, steady=lambda: self.steady)
         self._other_end = EmulatorSettings(**shared)
         self.board = EmulatedBoard(self.firmware(), BoardPneumatics(2, seed), seed)
@@ -113,8 +113,8 @@ class Simulation:
 
     def _receive(self, data):
         while data and self.plugged:
-            commands, answer = self.board.receive(data, self.wall)
-            self.received += commands
+            commands, answer = self.board.receive(data)
+            self.received += [(self.wall, pressure) for pressure in commands]
             data = self.core.received(answer) if answer else b""
 
     def tick(self):

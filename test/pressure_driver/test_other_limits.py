@@ -114,7 +114,7 @@ def test_a_jump_to_the_limit_is_refused(simulate, limit):
 
 def test_over_pressure_is_seen_where_it_is_beyond_what_a_usual_limb_may_read():
     settings = Settings(protocol="native", pressure_limit=300_000.0)
-    monitor = TelemetryMonitor(host_protocol("native", 4, settings), settings)
+    monitor = TelemetryMonitor(host_protocol(settings), settings)
     for now in (0.0, 0.05):
         reading = (101_325.0 + 400_000.0, 101_325.0, 101_325.0, 101_325.0)
         monitor.receive(Telemetry(reading, supply_pressure=500_000.0), now, resting=False)

@@ -24,7 +24,7 @@ def answer(host, *words):
 
 def told(data):
     """Return first register and words of a write, which is alone: servers lose a second request."""
-    ((_, write),) = festo.ModbusReader().feed(data)
+    (write,) = festo.cut_frames(bytearray(data))
     first, count = struct.unpack(">HH", write.data[:4])
     words = festo.to_words(write.data[5:])
     assert len(words) == count
@@ -35,10 +35,11 @@ def told(data):
 
 
 def test_setpoints_of_a_motion_terminal_stand_behind_the_mode_of_their_slot():
-    host = host_protocol("festo")
-    data, number = host.setpoint([7_540.0, 0.0, 0.0, 20_000.0])
+    host = host_protocol(Settings(protocol="festo"))
+    data = host.setpoint([7_540.0, 0.0, 0.0, 20_000.0])
     assert told(data) == (40003, (0xC3, 75, 0, 0xC3, 0, 200))
     assert host.follow_up() == b""
+    number = host.number
     assert host.decode(festo.encode(number, festo.WRITE, struct.pack(">HH", 40003, 6))) == [
         Echo(number)
     ]
@@ -47,11 +48,11 @@ def test_setpoints_of_a_motion_terminal_stand_behind_the_mode_of_their_slot():
 
 
 def test_slots_are_acknowledged_for_half_a_second_before_they_are_started():
-    host = host_protocol("festo")
+    host = host_protocol(Settings(protocol="festo"))
     clock = host.clock = Clock()
 
     def mode():
-        return told(host.vent()[0])[1][0]
+        return told(host.vent())[1][0]
 
     host.start()
     assert mode() == 0xC3, "a terminal that runs already is vented first"
@@ -80,7 +81,7 @@ def test_slots_are_acknowledged_for_half_a_second_before_they_are_started():
 
 
 def test_a_slot_that_ceases_to_run_is_a_failure_once():
-    host = host_protocol("festo")
+    host = host_protocol(Settings(protocol="festo"))
     answer(host, RUNNING, 0, 0, RUNNING, 0, 0)
     events = answer(host, RUNNING, 0, 0, 9 << 8 | 3 << 6 | 3, 0, 0)
     assert events[0] == BoardFailure("slot 1 does not run: mode 3, state 3 (failed), application 9")
@@ -88,8 +89,8 @@ def test_a_slot_that_ceases_to_run_is_a_failure_once():
 
 
 def test_a_refusal_of_the_terminal_is_named():
-    host, board = host_protocol("festo", 8), FestoBoard(4)
-    commands = board.decode(host.vent()[0])
+    host, board = host_protocol(Settings(protocol="festo", segment_count=4)), FestoBoard(4)
+    commands = board.decode(host.vent())
     reading = BoardReading(0.0, (ROOM,) * 4, ROOM, (0.0,) * 4, 0.0)
     (event,) = host.decode(b"".join(board.reply(command, reading) for command in commands))
     assert isinstance(event, BoardFailure)
@@ -104,11 +105,11 @@ def test_a_terminal_with_regulators_is_played(simulate):
     assert sim.gauge[0] > 2_000.0
     first, words = told(sim.sent[-1])
     assert (first, len(words)) == (40003, 4)
-    assert all(festo.signed(word) >= 0 for word in words)
+    assert all(word >= 0 for word in words)
 
 
 def test_a_diagnosis_of_a_regulator_is_a_failure():
-    host = host_protocol("festo", 4, Settings(protocol="festo", terminal="mpa"))
+    host = host_protocol(Settings(protocol="festo", terminal="mpa"))
     answer(host, *(0, 0, 0) * 4)
     assert host.unsettled == ""
     failure, _ = answer(host, *(0, 0, 0) * 3, 0, 0, 5)
@@ -119,10 +120,10 @@ def test_a_diagnosis_of_a_regulator_is_a_failure():
 
 
 def test_frames_of_a_pneudrive_board():
-    host = host_protocol("pneudrive")
-    data, _ = host.setpoint([68_950.0, 0.0, 0.0, 0.0])
+    host = host_protocol(Settings(protocol="pneudrive"))
+    data = host.setpoint([68_950.0, 0.0, 0.0, 0.0])
     assert data == bytes.fromhex("ffff 00b8 0066 0066 0066")
-    assert host.setpoint([1e6, 0.0, 0.0, 0.0])[0][2:4] == (1023).to_bytes(2, "big")
+    assert host.setpoint([1e6, 0.0, 0.0, 0.0])[2:4] == (1023).to_bytes(2, "big")
     (reading,) = [
         event
         for event in host.decode(bytes.fromhex("ffff 00b8 0066 0066 0066"))
@@ -132,8 +133,8 @@ def test_frames_of_a_pneudrive_board():
 
 
 def test_a_pneudrive_board_answers_to_its_own_number_alone():
-    host = host_protocol("pneudrive", 4, Settings(protocol="pneudrive", device=2))
-    data, _ = host.setpoint([68_950.0, 0.0, 0.0, 0.0])
+    host = host_protocol(Settings(protocol="pneudrive", device=2))
+    data = host.setpoint([68_950.0, 0.0, 0.0, 0.0])
     assert data == bytes.fromhex("fffd 00b8 0066 0066 0066")
     board = PneudriveBoard(4)
     assert board.decode(data) == []

@@ -21,8 +21,9 @@ from pressure_driver import lines, port_process
 from pressure_driver.board import BoardProcess
 from pressure_driver.emulator.board import EmulatedBoard, Faults
 from pressure_driver.emulator.firmware import BOARDS
+from pressure_driver.emulator.line import emulated_line
 from pressure_driver.emulator.pneumatics import BoardPneumatics
-from pressure_driver.emulator.runner import BoardRunner, emulated_line
+from pressure_driver.emulator.runner import BoardRunner
 from pressure_driver.lines import Channel, open_line, tcp_address
 from pressure_driver.port_process import PortError, PortProcess, explain, stable_name
 from pressure_driver.protocols import NAMES
@@ -57,10 +58,10 @@ class Rig:
         firmware = BOARDS[protocol]()
         firmware.configure(EmulatorSettings(sensor_range=SENSOR_RANGE))
         self.board = EmulatedBoard(firmware, air, 1)
-        self.runner = BoardRunner(self.board, self.port, on_command=self.commands.append)
+        self.runner = BoardRunner(self.board, self.port, on_command=self.note)
         self.runner.start()
         self.settings = Settings(
-            port=str(self.port.link),
+            port=self.port.link,
             protocol=protocol,
             atmosphere=self.board.atmosphere,
             sensor_range=SENSOR_RANGE,
@@ -69,6 +70,9 @@ class Rig:
             hold_time=0.2,
         )
         self.said, self.state, self.armings = [], {}, 0
+
+    def note(self, _, pressure):
+        self.commands.append(pressure)
 
     def start(self):
         """Have the node's end of the driver in this process, and the port's in one of its own."""
@@ -109,7 +113,7 @@ class Rig:
 
     def vents(self, since=0):
         """Tell for each command since one of them whether it asks for equal pressures."""
-        pairs = [list(c.pressure) for c in list(self.commands)[since:]]
+        pairs = list(self.commands)[since:]
         return [max(abs(p[0] - p[1]), abs(p[2] - p[3])) < 1.0 for p in pairs]
 
     def wait_vented(self):
@@ -204,7 +208,7 @@ def test_vent_is_at_once_and_the_end_leaves_the_port(rig):
     wait_for(lambda: rig.vents()[-3:] == [True] * 3, "the last commands")
     rig.wait_vented()
     wait_for(lambda: not rig.port.host_present, "the port to be left")
-    open_line(str(rig.port.link), 115_200).close(drop=True)
+    open_line(rig.port.link, 115_200).close(drop=True)
 
 
 def test_by_hand_it_takes_lines_from_a_terminal(rig):
@@ -365,12 +369,13 @@ def test_a_connection_that_ends_is_a_fault_and_the_next_one_vents(make_rigs):
 
 
 @pytest.mark.parametrize("reads", [True, False])
-def test_a_far_board_acknowledges_late_what_it_reads(reads):
+def test_a_far_board_acknowledges_late_what_it_reads(reads, monkeypatch):
+    monkeypatch.setattr(lines, "bytes_waiting", lambda _: 102)
     near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     with near, far:
         process = BoardProcess(Settings(real_time_priority=0), Channel(near), 1.0)
         lost = []
-        process._line, process._lose = SimpleNamespace(waiting=lambda: 102), lost.append
+        process._line, process._lose = SimpleNamespace(fileno=lambda: -1), lost.append
         for tick in range(40):
             process.core.clock = lambda tick=tick: tick / 20
             process._bytes_sent += 34 * reads
@@ -380,7 +385,7 @@ def test_a_far_board_acknowledges_late_what_it_reads(reads):
 
 def test_the_last_vent_command_may_be_acknowledged_late(monkeypatch):
     waiting = iter([102, 34, 0])
-    monkeypatch.setattr(lines, "_waiting", lambda _: next(waiting))
+    monkeypatch.setattr(lines, "bytes_waiting", lambda _: next(waiting))
     near, far = socket.socketpair()
     with near, far:
         assert lines.vent_line(near.fileno(), b"vent", 0.01) == ""
@@ -394,7 +399,7 @@ def test_ports_that_do_not_open_are_named_with_the_remedy(rig, tmp_path):
     file.write_text("text")
     for port, told in (
         (missing, f"no serial device {re.escape(missing)}.*ports that exist"),
-        (str(rig.port.link), r"in use by another program.*fuser"),
+        (rig.port.link, r"in use by another program.*fuser"),
         (str(file), "is no serial port"),
     ):
         with pytest.raises(SerialException) as raised:

@@ -8,6 +8,7 @@ import pytest
 from pressure_driver.emulator.firmware import BOARDS
 from pressure_driver.protocols import BoardReset, host_protocol
 from pressure_driver.safety import Mode
+from pressure_driver.settings import Settings
 
 PERIOD = 0.05
 
@@ -26,7 +27,7 @@ def test_a_reset_of_the_board_is_a_fault_and_does_not_refill_the_limb(simulate, 
     sim.stream(4.0)
     assert sim.mode is Mode.FAULT
     assert all(
-        np.ptp(np.reshape(c.pressure, (-1, 2)), axis=1).max() < 1.0 for c in sim.received[received:]
+        np.ptp(np.reshape(p, (-1, 2)), axis=1).max() < 1.0 for _, p in sim.received[received:]
     )
     assert sim.vented
     if protocol == "ezloop":
@@ -81,7 +82,7 @@ def test_echoes_that_stop_are_a_fault_within_two_seconds(simulate, protocol):
 
 
 def test_one_damaged_report_of_a_ctrlp_board_is_no_reset():
-    host = host_protocol("ctrlp")
+    host = host_protocol(Settings(protocol="ctrlp"))
     host.unsettled = ""
     line = "{}\t1\t0.000\t0.000\t0.000\t0.000\n"
     for time in (10_000, 10_050, 2_100, 10_150, 90_200, 10_250, 10_300):
@@ -93,14 +94,14 @@ def test_one_damaged_report_of_a_ctrlp_board_is_no_reset():
 
 
 def test_echoes_and_warnings_of_a_ctrlp_board_are_no_reset():
-    host = host_protocol("ctrlp")
+    host = host_protocol(Settings(protocol="ctrlp"))
     board = BOARDS["ctrlp"]()
     from pressure_driver.emulator import BoardReading
 
     reading = BoardReading(0.0, (101_325.0,) * 4, 101_325.0, (0.0,) * 4, 0.0)
     answers = b"".join(
         board.reply(command, reading)
-        for command in board.decode(host.start() * 2 + host.setpoint([1e3, 0.0, 0.0, 0.0])[0])
+        for command in board.decode(host.start() * 2 + host.setpoint([1e3, 0.0, 0.0, 0.0]))
     )
     events = host.decode(answers + b"_UNREC: Unrecognized Command\n")
     assert not [e for e in events if isinstance(e, BoardReset)]
@@ -119,14 +120,14 @@ def test_echoes_and_warnings_of_a_ctrlp_board_are_no_reset():
     ],
 )
 def test_units_are_confirmed_by_name_or_number_for_commands_and_reports(answer, settled):
-    host = host_protocol("ctrlp")
+    host = host_protocol(Settings(protocol="ctrlp"))
     host.decode(answer)
     assert (host.unsettled == "") is settled
     assert settled or answer[1:-2].strip().decode() in host.unsettled
 
 
 def test_lines_of_setpoints_and_of_the_supply_are_no_damage():
-    host = host_protocol("ctrlp")
+    host = host_protocol(Settings(protocol="ctrlp"))
     lines = b"50\t0\t0.00\t0.00\t0.00\t0.00\r\n50\t1\t1.00\t0.00\t0.00\t0.00\r\n50\t2\t40.00\r\n"
     _, measured, supply = host.decode(lines)
     assert host.rejected == 0
@@ -135,7 +136,7 @@ def test_lines_of_setpoints_and_of_the_supply_are_no_damage():
 
 
 def test_the_clock_of_a_native_board_may_overflow():
-    host, board = host_protocol("native"), BOARDS["native"]()
+    host, board = host_protocol(Settings(protocol="native")), BOARDS["native"]()
     from pressure_driver.emulator import BoardReading
 
     def status(milliseconds):

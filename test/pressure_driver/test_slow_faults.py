@@ -108,7 +108,7 @@ def test_a_board_that_fills_a_little_too_high_ends_vented(simulate):
 
 
 def test_a_late_status_of_an_older_command_leaves_the_newest_waiting():
-    watch = BoardWatch(host_protocol("native"), Settings())
+    watch = BoardWatch(host_protocol(Settings(protocol="native")), Settings())
     watch.has_sent(8, 1.00)
     watch.take_echo(Echo(7), 1.01)
     assert np.isnan(watch.round_trip)

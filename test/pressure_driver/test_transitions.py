@@ -43,7 +43,7 @@ def test_each_setpoint_is_on_the_wire_at_its_stamp(simulate, protocol):
         sim.offer(u, index=index)
         sim.tick()
     sim.run(0.2)
-    got = {c.stamp: np.array(c.pressure) for c in sim.received}
+    got = {stamp: np.array(pressure) for stamp, pressure in sim.received}
     step = max(1.1, sim.core.protocol.resolution)
     for stamp, u in wanted.items():
         pressure = got[stamp]

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, cast
 from pressure_driver import lines
 from pressure_driver.core import DriverCore
 from pressure_driver.following import Duration
-from pressure_driver.lines import Channel, Line, may_open, open_line, vent_line
+from pressure_driver.lines import Channel, Line, open_line, vent_line
 from pressure_driver.protocols import host_protocol
 from pressure_driver.schedule import Origin, Setpoint, TickGrid, Verdict
 
@@ -60,7 +60,7 @@ class BoardProcess:
     """
 
     def __init__(self, settings: Settings, channel: Channel, patience: float) -> None:
-        protocol = host_protocol(settings.protocol, 2 * settings.segment_count, settings)
+        protocol = host_protocol(settings)
         self.core = DriverCore(protocol, settings, log=self._log)
         self.grid = TickGrid(self.core.machine.schedule.period)
         self.ending = False
@@ -72,7 +72,6 @@ class BoardProcess:
         self._line: Line | None = None
         self._bytes_waiting: select.epoll | None = None
         self._bytes_sent = self._bytes_read = self._bytes_received = self._reconnects = 0
-        self._unsent = b""
         self._unread = Duration()
         self._was_venting = True
         self._retry_at = 0.0
@@ -132,16 +131,14 @@ class BoardProcess:
         """Wait for bytes, a message or the tick, and serve what came."""
         self._look_for_port()
         delay = min(max(self.grid.delay(time.time_ns()), 0.0), LONGEST_WAIT)
-        watched: list[Any] = [self._channel]
-        if self._bytes_waiting is not None:
-            watched.append(self._bytes_waiting)
+        watched = [each for each in (self._channel, self._bytes_waiting) if each is not None]
         readable, _, _ = select.select(watched, [], [], delay)
         instant = self.grid.take(time.time_ns())
         if instant is not None:
             self._tick(instant)
         if self._channel in readable:
             self._serve_messages()
-        if self._bytes_waiting is not None and self._bytes_waiting in readable:
+        if self._bytes_waiting in readable:
             self._read()
         self._show_life()
 
@@ -183,7 +180,9 @@ class BoardProcess:
         elif word == "vent":
             self._send("answer", *self._vent_now())
         elif word == "lease":
-            self._renew_lease(*content)
+            source, period = content
+            if problem := self.core.machine.leases.renew(source, period, self.core.clock()):
+                self._log(problem, True)
         elif word == "end":
             self.end()
 
@@ -193,11 +192,6 @@ class BoardProcess:
         if verdict is not Verdict.ACCEPTED and now - self._refused_at >= REFUSAL_PERIOD:
             self._refused_at = now
             self._log(f"{verdict.value}: {self.core.machine.schedule.reason}", True)
-
-    def _renew_lease(self, source: str, period: float) -> None:
-        core = self.core
-        if problem := core.machine.leases.renew(source, period, core.clock()):
-            self._log(problem, True)
 
     def _vent_now(self) -> tuple[bool, str]:
         """Vent before the next tick, and before all that waits to be sent."""
@@ -230,19 +224,18 @@ class BoardProcess:
         self._write(self.core.opening())
         if self._line is not None:
             descriptor = self._line.fileno() if self._line.shared else None
-            self._send("port", self.core.protocol.emergency().hex(), descriptor=descriptor)
+            self._send("port", descriptor=descriptor)
 
     def _look_for_port(self) -> None:
         """Open a port that was lost as soon as its name is there again."""
         if self._line is not None or time.monotonic() < self._retry_at:
             return
-        if may_open(self._port):
-            with contextlib.suppress(OSError, ValueError):
-                self._line = open_line(self._port, self._baud_rate)
-                self._reconnects += 1
-                self._log(f"{self._port} is back", True)
-                self._opened()
-            self._retry_at = time.monotonic() + RETRY_TIME
+        with contextlib.suppress(OSError, ValueError):
+            self._line = open_line(self._port, self._baud_rate)
+            self._reconnects += 1
+            self._log(f"{self._port} is back", True)
+            self._opened()
+        self._retry_at = time.monotonic() + RETRY_TIME
 
     def _watch_queue(self) -> None:
         """Lose the port if what has been written stays where it is: the board does not read."""
@@ -250,10 +243,9 @@ class BoardProcess:
             return
         now, waiting = self.core.clock(), 0
         with contextlib.suppress(OSError):
-            waiting = self._line.waiting()
+            waiting = lines.bytes_waiting(self._line.fileno())
         # What is under way to a board that is far is acknowledged later.
         read, self._bytes_read = self._bytes_read, self._bytes_sent - waiting
-        waiting += len(self._unsent)
         self._unread.note(waiting > 0 and self._bytes_read == read, now)
         if self._unread.until(now) > UNREAD_TIME:
             self._lose(
@@ -263,9 +255,8 @@ class BoardProcess:
 
     def _drop_unsent(self) -> None:
         """Throw away what waits to be sent; a frame may be cut, so a separator must follow."""
-        self._unsent = b""
         if self._line is not None:
-            self._line.drop()
+            lines.flush(self._line.fileno())
 
     def _read(self) -> None:
         """Take the bytes that are there; none means that the device has gone."""
@@ -283,30 +274,21 @@ class BoardProcess:
     def _write(self, data: bytes) -> None:
         """Hand bytes to the operating system without ever waiting for it.
 
-        What it does not take is sent before the next command; if that is not taken either, the
-        port counts as lost.
+        The port is lost if it does not take them all: there is room for many commands.
         """
         if self._line is None or not data:
             return
-        left_over = len(self._unsent)
-        pending = self._unsent + data
         try:
-            count = self._line.write(pending)
-        except BlockingIOError:
-            count = 0
+            self._line.write(data)
         except OSError as error:
             self._lose(f"writing to {self._port} failed: {error}")
             return
-        self._bytes_sent += count
-        self._unsent = pending[count:]
-        if count < left_over:
-            self._lose(f"{self._port} takes no bytes: the board does not read")
+        self._bytes_sent += len(data)
 
     def _lose(self, reason: str) -> None:
         """Close what is left of the port and arrange for the next attempt."""
         self._release(drop=True)
         self._send("lost")
-        self._unsent = b""
         self._retry_at = time.monotonic() + RETRY_TIME
         self._log(reason, True)
         self.core.lost(f"serial link lost: {reason}")
@@ -333,7 +315,7 @@ class BoardProcess:
 
     def _send_last_words(self, duration: float) -> str:
         """Repeat the vent command and leave the port; return what is left to be done."""
-        if self._line is None and may_open(self._port):
+        if self._line is None:
             with contextlib.suppress(OSError, ValueError):
                 self._line = open_line(self._port, self._baud_rate)
         descriptor = -1 if self._line is None else self._line.fileno()

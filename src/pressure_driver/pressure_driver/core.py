@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 LARGEST_CLOCK_STEP = 0.3
 """[s] between two ticks, above slewing and late wakes, that means the wall clock was set."""
 MOST_TEXTS = 20
-"""Texts of the board that wait to be logged, one a tick; more are only counted."""
+"""Texts of the board that wait to be logged, one a tick; of more, the newest."""
 IDENTITY_RETRY = 1.0
 """[s] after which a board that has not introduced or set itself up is greeted again."""
 ECHO_TIMEOUT = 1.0
@@ -59,8 +59,7 @@ class BoardWatch:
         self._greeted_at = 0.0
 
     def opened(self, now: float) -> None:
-        """The port has been opened, and the board greeted: nothing is known about it."""
-        self.identity = None
+        """The port has been opened, and the board greeted."""
         self._unanswered.clear()
         self._greeted_at = now
 
@@ -70,9 +69,7 @@ class BoardWatch:
 
     def greeting(self, now: float) -> bytes:
         """Return the greeting again while it has not been answered; a board may boot slowly."""
-        unknown = self._protocol.introduces_itself and self.identity is None
-        answered = not (self._protocol.unsettled or unknown)
-        if answered or now - self._greeted_at < IDENTITY_RETRY:
+        if not self._protocol.unsettled or now - self._greeted_at < IDENTITY_RETRY:
             return b""
         self._greeted_at = now
         return self._protocol.start()
@@ -97,17 +94,15 @@ class BoardWatch:
         protocol, identity = self._protocol, self.identity
         wanted = self._settings.pressure_limit
         reach = min(protocol.reach, identity.largest_pressure if identity else wanted)
-        problem = ""
-        if protocol.introduces_itself and identity is None:
-            problem = "the board has not introduced itself yet"
-        elif identity and identity.chamber_count != protocol.chamber_count:
+        problem = protocol.unsettled
+        if identity and identity.chamber_count != protocol.chamber_count:
             problem = (
                 f"the board has {identity.chamber_count} chambers, the driver expects "
                 f"{protocol.chamber_count}: set the parameter 'segment_count'"
             )
         elif reach < wanted:
             problem = f"the board reaches {reach:.0f} Pa: lower 'pressure_limit' ({wanted:.0f} Pa)"
-        if problem := problem or protocol.unsettled:
+        if problem:
             yield Condition(problem, lasting=False)
         waits_since = self._unanswered[0][1] if self._unanswered else now
         if protocol.echoes and now - waits_since > ECHO_TIMEOUT:
@@ -135,8 +130,6 @@ class DriverCore:
         protocol.assumed_atmosphere = settings.atmosphere or STANDARD_ATMOSPHERE
         self.venting = True
         """Whether the bytes of the last tick were the vent command."""
-        self.unlogged_texts = 0
-        """Texts of the board that came too fast for the log."""
         self.last_text = ""
         """What the board has said last in plain words."""
         self.clock = RunningClock(2.0 / settings.rate, steady)
@@ -148,10 +141,9 @@ class DriverCore:
         self._valves = order_of(settings.wiring, protocol.chamber_count)
         self._log = log
         self._link_fault = "the serial port is not open"
-        self._texts: deque[str] = deque()
+        self._texts: deque[str] = deque(maxlen=MOST_TEXTS)
         self._last_tick = 0
         self._last_mode = Mode.DISARMED
-        self._pending_number: int | None = None
         self._clock_offset = 0.0
 
     def _conditions(self, now: float) -> Iterator[Condition]:
@@ -244,7 +236,6 @@ class DriverCore:
             "damaged_frames": self.protocol.rejected,
             "last_damaged_line": self.protocol.last_damaged,
             "ticks_held_back_by_slew_limit": machine.limited_ticks,
-            "board_texts_not_logged": self.unlogged_texts,
         }
 
     # ----------------------------------------------------------------------- to the board
@@ -255,7 +246,7 @@ class DriverCore:
         self.monitor.forget()
         self._link_fault = ""
         self.board.opened(self.clock())
-        return self.protocol.start() + self._vent_bytes()
+        return self.protocol.start() + self.protocol.vent()
 
     def tick(self, instant: int) -> bytes:
         """Return the command of the tick at this wall time [ns]."""
@@ -268,28 +259,21 @@ class DriverCore:
         self.venting = vent or bool(self.protocol.unsettled)
         if self.venting:
             self.machine.command_nothing()
-            return self.board.greeting(now) + self._vent_bytes()
+            return self.board.greeting(now) + self.protocol.vent()
         asked = dict(zip(self._valves, chamber_gauge(self.machine.differential), strict=True))
-        data, self._pending_number = self.protocol.setpoint(
-            [asked[valve] for valve in sorted(asked)]
-        )
-        return data
+        return self.protocol.setpoint([asked[valve] for valve in sorted(asked)])
 
     def sent(self) -> None:
         """Do what can wait until the bytes of the tick are out."""
         now = self.clock()
         self.monitor.command(self.machine.differential, now)
-        self.board.has_sent(self._pending_number, now)
+        self.board.has_sent(self.protocol.number, now)
         self._note_mode()
         if self._texts:
             self._log(f"board: {self._texts.popleft()}", False)
 
     def _wire_atmosphere(self) -> float:
         return self.monitor.rest.mean if self.monitor.rest.known else STANDARD_ATMOSPHERE
-
-    def _vent_bytes(self) -> bytes:
-        data, self._pending_number = self.protocol.vent()
-        return data
 
     def _watch_wall_clock(self, instant: int) -> None:
         """Drop the schedule if the wall clock was set: its stamps do not mean what they meant."""
@@ -331,7 +315,7 @@ class DriverCore:
         elif isinstance(event, Echo):
             self.board.take_echo(event, now)
         elif isinstance(event, BoardFailure):
-            self._log_text(event.text)
+            self._texts.append(event.text)
             self.machine.fail(f"board reports {event.text}")
         elif isinstance(event, BoardReset):
             self._set_up_anew(event, now)
@@ -339,7 +323,7 @@ class DriverCore:
             self.board.identity = event
         elif isinstance(event, BoardText):
             self.last_text = event.text
-            self._log_text(event.text)
+            self._texts.append(event.text)
 
     def _of_chambers(self, told: tuple[float, ...] | None) -> tuple[float, ...] | None:
         """Return what a board tells of its valves in the order of the limb's chambers."""
@@ -349,20 +333,12 @@ class DriverCore:
         """Greet a board that has been reset; what was being played must not be played on."""
         reason = f"the board has been reset: {reset.sign}"
         self._log(reason, True)
-        self.board.identity = None
         self.board.greet_now(now)
         self.monitor.forget()
         if self.machine.mode in LIVE:
             self.machine.fail(reason)
 
     # -------------------------------------------------------------------------- to the log
-
-    def _log_text(self, text: str) -> None:
-        """Keep what the board says for the log, unless it talks too much."""
-        if len(self._texts) < MOST_TEXTS:
-            self._texts.append(text)
-        else:
-            self.unlogged_texts += 1
 
     def _note_mode(self) -> None:
         mode = self.machine.mode

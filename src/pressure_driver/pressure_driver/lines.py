@@ -1,7 +1,5 @@
 """The lines of the process of the port: to the board, serial or `tcp://`, and to the node.
 
-And the board's end of `tcp://`.
-
 The line to the board is a descriptor that the process waits for and never waits in. A serial port
 is handed to the driver's node beside the process, which vents through it. A connection is not: what
 the process has sent by halves would be in it, so whoever vents opens one of its own.
@@ -31,8 +29,6 @@ VENT_PERIOD = 0.05
 """[s] between two vent commands of a process that vents in the place of another."""
 CONNECT_TIME = 0.4
 """[s] for a connection: over WLAN some take 0.2 s, and meanwhile nothing runs."""
-LONGEST_LOOK = 20_000_000
-"""[ns] between two looks for a host that wants a connection."""
 ADVICE = "close the air supply"
 IN_USE = (errno.EAGAIN, errno.EBUSY, errno.EADDRINUSE)
 """Error numbers of a line that another program has."""
@@ -97,8 +93,7 @@ class Line:
         self._claim = socket.socket(socket.AF_UNIX)
         try:
             if self.shared:
-                options = {"timeout": 0, "write_timeout": 0.05, "exclusive": True}
-                self._device = serial.Serial(port, baud_rate, **options)
+                self._device = serial.Serial(port, baud_rate, timeout=0, exclusive=True)
                 with contextlib.suppress(OSError):
                     fcntl.ioctl(self._device.fileno(), termios.TIOCEXCL)
                 return
@@ -132,26 +127,18 @@ class Line:
             raise ConnectionResetError(errno.ECONNRESET, "the board has closed the connection")
         return b""
 
-    def write(self, data: bytes) -> int:
-        """Hand bytes to the operating system without waiting; return how many it has taken.
+    def write(self, data: bytes) -> None:
+        """Hand bytes to the operating system without waiting.
 
         Raises:
-            BlockingIOError: it takes none.
-            OSError: the board has gone, or a connection is full: half a frame cannot be taken back.
+            OSError: the board has gone, or does not read so that there is no room for them.
         """
-        # pyserial's own `write` waits for the terminal after each write.
-        count = os.write(self.fileno(), data)
-        if count < len(data) and not self.shared:
-            raise OSError(errno.ENOBUFS, "the connection takes no bytes")
-        return count
-
-    def waiting(self) -> int:
-        """Return how many bytes have not left, or over TCP have not been acknowledged."""
-        return _waiting(self.fileno())
-
-    def drop(self) -> None:
-        """Throw away what has not left; of a connection, the kernel gives nothing back."""
-        _flush(self.fileno())
+        count = 0
+        with contextlib.suppress(BlockingIOError):
+            # pyserial's own `write` waits for the terminal after each write.
+            count = os.write(self.fileno(), data)
+        if count < len(data):
+            raise OSError(errno.ENOBUFS, "it takes no bytes: the board does not read")
 
     def close(self, drop: bool) -> None:
         """Leave the line without waiting for the board.
@@ -164,7 +151,7 @@ class Line:
         """
         with contextlib.suppress(Exception):
             if drop and self.shared:
-                self.drop()
+                flush(self.fileno())
             elif drop:
                 now = struct.pack("ii", 1, 0)
                 self._device.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, now)
@@ -192,11 +179,6 @@ def tcp_address(port: str) -> tuple[str, int]:
         if found.hostname and found.port:
             return found.hostname, found.port
     raise OSError(errno.EINVAL, f"'{port}' is no address: write tcp://host:port")
-
-
-def may_open(port: str) -> bool:
-    """Return whether it is worth while to try to open a line: a serial port must have its file."""
-    return is_tcp(port) or os.path.exists(port)
 
 
 def open_line(port: str, baud_rate: int, patience: float = 0.0) -> Line:
@@ -235,15 +217,15 @@ def vent_line(descriptor: int, command: bytes, duration: float) -> str:
         return f"the board cannot be reached: {ADVICE}"
     taken, end = False, time.monotonic() + duration
     try:
-        _flush(descriptor)
+        flush(descriptor)
         while time.monotonic() < end:
             try:
                 taken = os.write(descriptor, command) == len(command)
             except BlockingIOError:
                 taken = False
-                _flush(descriptor)
+                flush(descriptor)
             time.sleep(VENT_PERIOD)
-        while (waiting := _waiting(descriptor)) and time.monotonic() < end + CONNECT_TIME:
+        while (waiting := bytes_waiting(descriptor)) and time.monotonic() < end + CONNECT_TIME:
             time.sleep(VENT_PERIOD)
     except (OSError, termios.error) as error:
         return f"the port is gone ({error}): {ADVICE}"
@@ -273,114 +255,16 @@ def release_descriptor(descriptor: int) -> None:
         os.close(descriptor)
 
 
-def _flush(descriptor: int) -> None:
-    """Throw away what is in the output queue of a terminal; a connection has none to throw away."""
+def flush(descriptor: int) -> None:
+    """Throw away what is in the output queue of a terminal; a connection gives nothing back."""
     with contextlib.suppress(termios.error):
         termios.tcflush(descriptor, termios.TCOFLUSH)
 
 
-def _waiting(descriptor: int) -> int:
+def bytes_waiting(descriptor: int) -> int:
     """Return how many bytes have not left a terminal, or have not been acknowledged over TCP."""
     (waiting,) = struct.unpack("i", fcntl.ioctl(descriptor, termios.TIOCOUTQ, bytes(4)))
     return int(waiting)
-
-
-class BoardSocket:
-    """A board in a network: what an emulated board and `topic_board` listen with.
-
-    Bytes cost no time. The newest connection counts: whoever makes it has to vent.
-
-    Args:
-        link: `tcp://host:port` to listen at.
-
-    Raises:
-        OSError: the address is not this computer's, or another program listens there.
-    """
-
-    def __init__(self, link: str) -> None:
-        self.link = link
-        self._server: socket.socket | None = None
-        self._host: socket.socket | None = None
-        self._incoming: list[tuple[int, bytes]] = []
-        self._outgoing = bytearray()
-        self.plug()
-
-    @property
-    def host_present(self) -> bool:
-        """Whether a host has a connection."""
-        return self._host is not None
-
-    def plug(self) -> None:
-        """Listen."""
-        if self._server is None:
-            self._server = socket.create_server(tcp_address(self.link))
-            self._server.setblocking(False)
-
-    def unplug(self) -> None:
-        """Reset the connection and listen no more."""
-        for each in (self._server, self._host):
-            if each is not None:
-                each.close()
-        self._server = self._host = None
-        self._incoming.clear()
-        self._outgoing.clear()
-
-    def watched(self) -> list[int]:
-        """Return the descriptors to wait for."""
-        return [each.fileno() for each in (self._server, self._host) if each is not None]
-
-    def read(self, now: int) -> bool:
-        """Take what the host has sent, as of now [ns]; nobody restarts a board in a network."""
-        with contextlib.suppress(BlockingIOError):
-            while self._server is not None:
-                host, _ = self._server.accept()
-                self._hear(now)
-                if self._host is not None:
-                    self._host.close()
-                self._host = host
-                host.setblocking(False)
-                host.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._hear(now)
-        return False
-
-    def _hear(self, now: int) -> None:
-        """Take what the host has sent, or see that it has gone."""
-        if self._host is None:
-            return
-        data = b""
-        with contextlib.suppress(BlockingIOError):
-            with contextlib.suppress(ConnectionError):
-                data = self._host.recv(1 << 16)
-            if data:
-                self._incoming.append((now, data))
-            else:
-                self._host.close()
-                self._host = None
-
-    def arrived(self, now: int) -> list[tuple[int, bytes]]:  # noqa: ARG002 - bytes cost no time
-        """Return (arrival [ns], bytes) of what the firmware can read now."""
-        ready, self._incoming = self._incoming, []
-        return ready
-
-    def send(self, data: bytes) -> None:
-        """Queue bytes for the host; they are dropped while nobody listens."""
-        if self._host is not None:
-            self._outgoing += data
-
-    def pump(self, now: int) -> None:  # noqa: ARG002 - bytes cost no time
-        """Write what is queued; a host that does not read loses it."""
-        if self._host is not None:
-            with contextlib.suppress(OSError):
-                self._host.send(self._outgoing)
-        self._outgoing.clear()
-
-    def next_event(self, now: int) -> int:  # noqa: ARG002
-        """Return the time [ns] until the line needs service, if no byte comes first."""
-        return 0 if self._incoming else LONGEST_LOOK
-
-    def close(self) -> None:
-        """Leave the network for good."""
-        self.unplug()
 
 
 def prefer_thread(priority: int) -> bool:

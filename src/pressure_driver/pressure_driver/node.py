@@ -20,7 +20,6 @@ from limb_interfaces.parameters import ParameterError, check_overrides, declare
 from limb_interfaces.runner import run_node
 from limb_interfaces.stamps import nanoseconds, stamp_from_nanoseconds
 from pressure_driver.port_process import PortProcess
-from pressure_driver.protocols import host_protocol
 from pressure_driver.safety import Mode
 from pressure_driver.settings import Declared, Settings, declarations
 
@@ -28,14 +27,10 @@ PASCAL_PER_HECTOPASCAL = 100.0
 CMD_U_T = "cmd_u_t"
 LIFE_PERIOD = 0.1
 """[s] between two signs of life to the port's process."""
-MOST_LINES = 20
-"""Lines of the log that one callback writes: whatever else waits has its turn in between."""
 CALLS = QoSProfile(depth=1000)
 """Of `arm` and `vent`: the middleware's depth of 10 loses requests that come at once."""
 STATE_FIELDS = set(PressureState.get_fields_and_field_types()) - {"header", "setpoint_stamp"}
 """Of the message, by the names of the state; what else the state has is for the diagnostics."""
-LONGEST_NAME = 100
-"""Characters of the source of a lease that are kept."""
 LATE_TICKS = 1200
 """Ticks over which it is told how late their bytes are written: a minute."""
 
@@ -74,7 +69,6 @@ class PressureDriver(Node):
                 "parameter 'use_sim_time' is true: the driver moves air in real time; leave it out"
             )
         settings = read_settings(self, Settings)
-        self._protocol = host_protocol(settings.protocol, 2 * settings.segment_count, settings)
         self._state: dict[str, Any] = {}
         self._late: deque[float] = deque(maxlen=LATE_TICKS)
         self._state_publisher = self.create_publisher(
@@ -121,7 +115,7 @@ class PressureDriver(Node):
         self._offer((0, differential, "", 0, 0), CMD_U_T, info)
 
     def _on_lease(self, message: OperatorLease) -> None:
-        self._port.send("lease", message.source[:LONGEST_NAME], message.period)
+        self._port.send("lease", message.source, message.period)
 
     def _offer(self, setpoint: tuple[object, ...], topic: str, info: dict[str, int]) -> None:
         alone = self.count_publishers(topic) <= 1
@@ -151,7 +145,7 @@ class PressureDriver(Node):
             self._state_publisher.publish(message)
 
     def _write_log(self) -> None:
-        for _ in range(min(len(self._port.log), MOST_LINES)):
+        for _ in range(len(self._port.log)):
             text, warning = self._port.log.popleft()
             # Two calls in two lines: rclpy remembers one severity for each place in the code.
             if warning:
@@ -161,7 +155,7 @@ class PressureDriver(Node):
 
     def _report(self) -> Health:
         """Tell what the state has beside the message, and how late ticks are."""
-        state, weaknesses = self._state, self._protocol.weaknesses
+        state, protocol = self._state, self._port.protocol
         if not state:
             return Health("stale", "starting")
         mode = Mode(state["mode"]).name
@@ -173,8 +167,8 @@ class PressureDriver(Node):
             "telemetry_age_s": _written(state["telemetry_age"]),
             "round_trip_s": _written(state["round_trip"]),
             "mode": mode,
-            "protocol": self._protocol.name,
-            "protocol_weaknesses": _written(weaknesses),
+            "protocol": protocol.name,
+            "protocol_weaknesses": _written(protocol.weaknesses),
             "port_process": self._port.process_id,
             **{
                 f"tick_to_write_{label}_ms": _written(late[round(share * (len(late) - 1))])
@@ -189,8 +183,8 @@ class PressureDriver(Node):
         if mode == "DISARMED" and state["obstacles_to_arming"]:
             level = "error" if math.isfinite(state["atmosphere_pa"]) else "stale"
             return Health(level, f"waiting for: {_written(state['obstacles_to_arming'])}", values)
-        if weaknesses:
-            return Health("warning", f"{mode}; {self._protocol.name}: {weaknesses[0]}", values)
+        if protocol.weaknesses:
+            return Health("warning", f"{mode}; {protocol.name}: {protocol.weaknesses[0]}", values)
         return Health("ok", mode, values)
 
     def close(self) -> None:

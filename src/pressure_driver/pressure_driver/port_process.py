@@ -4,7 +4,7 @@ Messages are JSON lists that begin with a word. From the node: ``setpoint``, ``a
 ``lease``, ``alive``, ``end``. To the node:
 
 =========== ==================================================================================
-``port``    the line is open: vent commands (hexadecimal), with the descriptor of a serial port
+``port``    the line is open, with the descriptor of a serial port
 ``lost``    the port is gone
 ``failed``  the port cannot be opened: the number of the error or null, its text
 ``state``   the state at each tick, by names
@@ -36,6 +36,7 @@ from serial.tools import list_ports
 
 from pressure_driver import lines
 from pressure_driver.lines import Channel, is_tcp, tcp_address
+from pressure_driver.protocols import host_protocol
 from pressure_driver.settings import Settings
 
 STABLE_NAMES = Path("/dev/serial/by-id")
@@ -134,7 +135,8 @@ class PortProcess:
         self._settings = replace(settings, port=stable_name(settings.port))
         self._on_message = on_message
         self._answers: queue.Queue[tuple[bool, str]] = queue.Queue()
-        self._vent_command = b""
+        self.protocol = host_protocol(settings)
+        """What the board understands."""
         self._descriptor = -1
         self._outcome: str | None = None
         self._thread = threading.Thread(target=self._listen, name="port process", daemon=True)
@@ -159,6 +161,7 @@ class PortProcess:
             env={**os.environ, "PYTHONSAFEPATH": "1"},
         )
         far.close()
+        self.process_id = self._process.pid
         self._channel = Channel(near)
         near.settimeout(START_TIME)
         try:
@@ -172,11 +175,6 @@ class PortProcess:
         self._serve(message, descriptor)
         near.settimeout(LOOK)
         self._thread.start()
-
-    @property
-    def process_id(self) -> int:
-        """Of the process."""
-        return self._process.pid
 
     # ---------------------------------------------------------------------------- requests
 
@@ -226,10 +224,11 @@ class PortProcess:
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(LOOK)
         if self._outcome is None:
+            command = self.protocol.emergency()
             if is_tcp(self._settings.port):
-                problem = lines.vent_anew(self._settings.port, self._vent_command, lines.VENT_TIME)
+                problem = lines.vent_anew(self._settings.port, command, lines.VENT_TIME)
             else:
-                problem = lines.vent_line(self._descriptor, self._vent_command, lines.VENT_TIME)
+                problem = lines.vent_line(self._descriptor, command, lines.VENT_TIME)
             told = f"the vent command was sent for {lines.VENT_TIME:g} s; see that it has vented"
             self.error = f"{reason}: {problem or told}"
         lines.release_descriptor(self._descriptor)
@@ -241,9 +240,7 @@ class PortProcess:
             if self._descriptor >= 0:
                 os.close(self._descriptor)
             self._descriptor = -1 if descriptor is None else descriptor
-        if word == "port":
-            self._vent_command = bytes.fromhex(content[0])
-        elif word == "state":
+        if word == "state":
             self.states.append(content[0])
         elif word == "log":
             self.log.append((content[0], content[1]))

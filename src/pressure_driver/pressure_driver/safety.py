@@ -51,8 +51,6 @@ class Mode(IntEnum):
 MOST_FAULTS = 16
 """Reasons that are kept; more would only be more of the same."""
 LIVE = (Mode.ARMED, Mode.TRACKING, Mode.HOLDING, Mode.VENTING)
-MOST_LEASES = 16
-"""Operators that are known at once."""
 LONGEST_LEASE = 60.0
 """[s] A longer promise says nothing."""
 
@@ -73,10 +71,8 @@ class OperatorLeases:
             return f"the lease of '{source}' lasts {period:g} s: give 0 to {LONGEST_LEASE:g} s"
         if period == 0.0:
             self._until.pop(source, None)
-        elif source in self._until or len(self._until) < MOST_LEASES:
-            self._until[source] = now + period
         else:
-            return f"the lease of '{source}' would be one of more than {MOST_LEASES}"
+            self._until[source] = now + period
         return ""
 
     def ended(self, now: float) -> list[str]:

@@ -12,6 +12,7 @@ from waiting import wait_for
 
 from pressure_driver.lines import Line
 from pressure_driver.protocols import Echo, Telemetry, host_protocol
+from pressure_driver.settings import Settings
 
 RUNNING = 3 | 2 << 6
 ROOM = 101_325.0
@@ -47,12 +48,12 @@ def plain_server():
 
 @pytest.mark.slow
 def test_registers_are_where_a_plain_server_has_them(plain_server):
-    host = host_protocol("festo")
+    host = host_protocol(Settings(protocol="festo"))
     line = Line("tcp://{}:{}".format(*plain_server))
     events = []
     try:
-        data, number = host.setpoint([7_500.0, 0.0, 0.0, 20_000.0])
-        line.write(data)
+        line.write(host.setpoint([7_500.0, 0.0, 0.0, 20_000.0]))
+        number = host.number
 
         def answered():
             events.extend(host.decode(line.read()))

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
-from pressure_driver.protocols import FrameBuffer
-from pressure_driver.settings import EmulatorSettings
+from pressure_driver.protocols import ProtocolEnd
 
 
 @dataclass(frozen=True)
@@ -17,8 +15,6 @@ class BoardCommand:
 
     kind: str
     """``setpoint``, ``vent``, ``hello``, ``read`` or another word of the protocol."""
-    first_byte: int
-    """Place of its first byte in the stream, counted from 0."""
     pressure: tuple[float, ...] | None = None
     """(2M,) [Pa] as sent: absolute or gauge after the protocol's ``gauge``."""
     valid_for: float | None = None
@@ -45,47 +41,19 @@ class BoardReading:
     """The board has vented since no setpoint came in time."""
 
 
-class BoardProtocol(ABC):
-    """The firmware's end, for emulators and tests of firmware.
-
-    Args:
-        chamber_count: 2M.
-        frames: cuts what the host sends.
-    """
+class BoardProtocol(ProtocolEnd):
+    """The firmware's end, for emulators and tests of firmware: it hears a `BoardCommand` each."""
 
     gauge: ClassVar[bool] = False
     """Whether the wire carries pressures above the atmosphere; else the differences of pairs."""
 
-    def __init__(self, chamber_count: int, frames: FrameBuffer) -> None:
-        self.chamber_count = chamber_count
-        self._frames = frames
-
-    @property
-    def rejected(self) -> int:
-        """Commands that were damaged or not understood."""
-        return self._frames.rejected
-
-    def configure(self, settings: EmulatorSettings) -> None:  # noqa: B027 - most have none
-        """Take over the parameters that are for this board alone."""
+    def __init__(self, chamber_count: int = 4) -> None:
+        super().__init__(chamber_count)
+        self.boot(0.0)
 
     def boot(self, atmosphere: float) -> bytes:  # noqa: ARG002 - most boards say nothing
         """Return what the board says after power-up."""
         return b""
-
-    def decode(self, data: bytes) -> list[BoardCommand]:
-        """Take the next bytes from the host and return the commands that became complete."""
-        commands = []
-        for place, frame in self._frames.feed(data):
-            command = None if frame is None else self._interpret(place, frame)
-            if command is None:
-                self._frames.rejected += 1
-            else:
-                commands.append(command)
-        return commands
-
-    @abstractmethod
-    def _interpret(self, place: int, frame: Any) -> BoardCommand | None:
-        """Return the command in a frame whose first byte has this place; None: it is damaged."""
 
     def target(
         self,

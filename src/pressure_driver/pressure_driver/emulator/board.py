@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
@@ -109,16 +108,6 @@ class Faults:
         return damaged.tobytes()
 
 
-@dataclass(frozen=True)
-class ReceivedCommand:
-    """A command as the board saw it on the wire."""
-
-    stamp: int
-    """[ns] arrival of its first byte."""
-    pressure: tuple[float, ...]
-    """(2M,) [Pa] absolute, decoded from the wire."""
-
-
 class EmulatedBoard:
     """Regulates the chambers of a `BoardPneumatics` as commanded over the wire.
 
@@ -135,8 +124,6 @@ class EmulatedBoard:
         self._generator = np.random.default_rng([seed, 0xB0A2D])
         count = pneumatics.chamber_count
         self._offset: NDArray[np.float64] = self._generator.uniform(0.0, SENSOR_OFFSET, count)
-        self._chunks: deque[tuple[int, int]] = deque()
-        self._stream_length = 0
         self._unsaid = b""
         self._dead_for = 0.0
         self.boot()
@@ -170,41 +157,29 @@ class EmulatedBoard:
         air.supply_pressure = faults.supply
         self._apply()
 
-    def receive(self, data: bytes, stamp: int) -> tuple[list[ReceivedCommand], bytes]:
+    def receive(self, data: bytes) -> tuple[list[tuple[float, ...]], bytes]:
         """Take bytes from the host.
 
-        Args:
-            data: as they come.
-            stamp: [ns] arrival of the first of them.
-
         Returns:
-            The commands that became complete, and what the board answers.
+            Pressures (2M,) [Pa], absolute, of each command that became complete, and what the board
+            answers.
         """
         if self._dead_for > 0.0:
             return [], b""
         if self.faults.drop > 0.0 and self._generator.random() < self.faults.drop:
             return [], b""
         data = self.faults.damage(data, self._generator)
-        self._chunks.append((self._stream_length, stamp))
-        self._stream_length += len(data)
-        received: list[ReceivedCommand] = []
+        received: list[tuple[float, ...]] = []
         answer = b""
         for command in self.protocol.decode(data):
             if self.faults.deaf and command.kind != "read":
                 continue
             answer += self._execute(command)
             if command.kind in ("setpoint", "vent"):
-                began = self._stamp_of(command.first_byte)
-                received.append(ReceivedCommand(began, self._wire_pressure(command)))
+                received.append(self._wire_pressure(command))
         if self.faults.mute:
             answer = b""
         return received, self.faults.damage(answer, self._generator)
-
-    def _stamp_of(self, place: int) -> int:
-        """Return when the byte at this place of the stream arrived."""
-        while len(self._chunks) > 1 and self._chunks[1][0] <= place:
-            self._chunks.popleft()
-        return self._chunks[0][1]
 
     def _wire_pressure(self, command: BoardCommand) -> tuple[float, ...]:
         if command.pressure is None:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 import re
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 from pressure_driver.emulator import BoardCommand, BoardProtocol, BoardReading
 from pressure_driver.emulator.polled import FestoBoard, PneudriveBoard
-from pressure_driver.protocols import LineSplitter, StreamCutter
+from pressure_driver.protocols import cut_at, cut_lines
 from pressure_driver.protocols.ctrlp import PASCAL_PER_KILOPASCAL
 from pressure_driver.protocols.ezloop import LARGEST_WIRE_VALUE, PASCAL_PER_HECTOPASCAL, numbers_of
 from pressure_driver.protocols.native import (
@@ -19,9 +19,9 @@ from pressure_driver.protocols.native import (
     STATUS_HEAD,
     FaultCode,
     Frame,
-    FrameSplitter,
     FrameType,
     StatusFlag,
+    cut_frames,
     encode,
 )
 
@@ -35,9 +35,6 @@ _COMMAND = re.compile(r"[A-Z]{2,12}(?:;-?\d{1,6}(?:\.\d{1,6})?)*")
 class EzloopBoard(BoardProtocol):
     """The firmware's end of ``ezloop``."""
 
-    def __init__(self, chamber_count: int = 4) -> None:
-        super().__init__(chamber_count, StreamCutter(b">", LONGEST_LIST))
-
     def boot(self, atmosphere: float) -> bytes:
         """Free text, as boards print it while they start."""
         return (
@@ -45,16 +42,19 @@ class EzloopBoard(BoardProtocol):
             f"room pressure {atmosphere / PASCAL_PER_HECTOPASCAL:.2f} hPa\r\nready\r\n"
         ).encode()
 
-    def _interpret(self, place: int, piece: bytes) -> BoardCommand | None:
+    def _cut(self) -> list[bytes | None]:
+        return cut_at(b">", LONGEST_LIST, self._kept)
+
+    def _interpret(self, piece: bytes) -> list[BoardCommand]:
         """Return what stands between ``<`` and ``>``, if it is a list of admissible numbers."""
-        before, bracket, body = piece.rpartition(b"<")
+        _, bracket, body = piece.rpartition(b"<")
         values = numbers_of(body.decode("latin-1"), ",")
         if not bracket or values is None or len(values) != self.chamber_count:
-            return None
+            return []
         if not all(math.isfinite(value) and value <= LARGEST_WIRE_VALUE for value in values):
-            return None
+            return []
         pressure = tuple(value * PASCAL_PER_HECTOPASCAL for value in values)
-        return BoardCommand("setpoint", place + len(before), pressure=pressure)
+        return [BoardCommand("setpoint", pressure)]
 
     def telemetry(self, reading: BoardReading) -> bytes:
         """Three lines: chambers, reservoir, valves."""
@@ -69,10 +69,6 @@ class CtrlpBoard(BoardProtocol):
 
     gauge = True
 
-    def __init__(self, chamber_count: int = 4) -> None:
-        super().__init__(chamber_count, LineSplitter())
-        self.boot(0.0)
-
     def boot(self, atmosphere: float) -> bytes:  # noqa: ARG002 - it measures gauge pressure
         """Reports are off until asked for, and pressures are in psi."""
         self._unit = "psi"
@@ -80,26 +76,29 @@ class CtrlpBoard(BoardProtocol):
         self._reports = False
         return b"_pressure controller\n"
 
-    def _interpret(self, place: int, line: str) -> BoardCommand:
+    def _cut(self) -> Iterator[str | None]:
+        return cut_lines(self._kept)
+
+    def _interpret(self, line: str) -> list[BoardCommand]:
         line = line.upper()  # the board understands small letters, too
         if _COMMAND.fullmatch(line):
             word, *arguments = line.split(";")
             numbers = [float(argument) for argument in arguments]
             if word in ("ON", "OFF"):
                 self._reports = word == "ON"
-                return BoardCommand("outputs", place, text=line)
+                return [BoardCommand("outputs", text=line)]
             if word == "ECHO":
-                return BoardCommand("echo", place, text=line)
+                return [BoardCommand("echo", text=line)]
             if word in ("MODE", "TIME") and numbers:
-                return BoardCommand("setting", place, text=line)
+                return [BoardCommand("setting", text=line)]
             if word == "UNITS" and numbers and numbers[0] in range(len(UNITS)):
                 self._unit = list(UNITS)[int(numbers[0])]
-                return BoardCommand("setting", place, text=line)
+                return [BoardCommand("setting", text=line)]
             if word == "SET" and len(numbers) == self.chamber_count + 1:
                 self._setpoint = tuple(value * UNITS[self._unit] for value in numbers[1:])
-                return BoardCommand("setpoint", place, pressure=self._setpoint, text=line)
-        self._frames.rejected += 1
-        return BoardCommand("unknown", place, text=line)
+                return [BoardCommand("setpoint", self._setpoint, text=line)]
+        self.rejected += 1
+        return [BoardCommand("unknown", text=line)]
 
     def telemetry(self, reading: BoardReading) -> bytes:
         """The lines of one report, if reports are on: setpoints and measured pressures."""
@@ -140,38 +139,31 @@ class NativeBoard(BoardProtocol):
         largest_pressure: int = 1_000_000,
         known: int = StatusFlag.SUPPLY_KNOWN | StatusFlag.VALVES_KNOWN,
     ) -> None:
-        super().__init__(chamber_count, FrameSplitter())
+        super().__init__(chamber_count)
         self._known = known
         self._largest = largest_pressure
-        self._sequence = 0
 
-    def _interpret(self, place: int, frame: Frame) -> BoardCommand | None:
+    def _cut(self) -> list[Frame | None]:
+        return cut_frames(self._kept)
+
+    def _interpret(self, frame: Frame) -> list[BoardCommand]:
         """Return HELLO, SETPOINT or VENT; a setpoint out of range comes back as ``refused``."""
         number, body = frame.sequence, frame.body
         if frame.type in (FrameType.HELLO, FrameType.VENT):
             kind = "hello" if frame.type is FrameType.HELLO else "vent"
-            return None if body else BoardCommand(kind, place, sequence=number)
+            return [] if body else [BoardCommand(kind, sequence=number)]
         if frame.type is not FrameType.SETPOINT:
-            return None
+            return []
         if len(body) != SETPOINT_HEAD.size + 4 * self.chamber_count:
-            return BoardCommand("refused", place, sequence=number, text="wrong length")
+            return [BoardCommand("refused", sequence=number, text="wrong length")]
         (milliseconds,) = SETPOINT_HEAD.unpack_from(body)
         values = struct.unpack_from(f"<{self.chamber_count}i", body, SETPOINT_HEAD.size)
         if not 0 < milliseconds <= LONGEST_VALIDITY:
-            return BoardCommand("refused", place, sequence=number, text="valid-for out of range")
+            return [BoardCommand("refused", sequence=number, text="valid-for out of range")]
         if min(values) < 0 or max(values) > self._largest:
-            return BoardCommand("refused", place, sequence=number, text="pressure out of range")
-        return BoardCommand(
-            "setpoint",
-            place,
-            pressure=tuple(float(value) for value in values),
-            valid_for=milliseconds / 1000.0,
-            sequence=number,
-        )
-
-    def _next(self) -> int:
-        self._sequence = (self._sequence + 1) & 0xFFFF
-        return self._sequence
+            return [BoardCommand("refused", sequence=number, text="pressure out of range")]
+        pressure = tuple(float(value) for value in values)
+        return [BoardCommand("setpoint", pressure, milliseconds / 1000.0, number)]
 
     def telemetry(self, reading: BoardReading) -> bytes:
         """One STATUS frame."""

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Sequence
+from functools import partial
 
-import numpy as np
-from numpy.typing import NDArray
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -16,10 +15,11 @@ from limb_interfaces import qos, topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
 from limb_interfaces.runner import run_node
 from limb_interfaces.stamps import stamp_from_nanoseconds
-from pressure_driver.emulator.board import EmulatedBoard, FaultError, Faults, ReceivedCommand
+from pressure_driver.emulator.board import EmulatedBoard, FaultError, Faults
 from pressure_driver.emulator.firmware import BOARDS
+from pressure_driver.emulator.line import emulated_line
 from pressure_driver.emulator.pneumatics import BoardPneumatics
-from pressure_driver.emulator.runner import BoardRunner, emulated_line
+from pressure_driver.emulator.runner import BoardRunner
 from pressure_driver.node import read_settings
 from pressure_driver.protocols import order_of
 from pressure_driver.settings import EmulatorSettings
@@ -53,15 +53,15 @@ class BoardEmulator(Node):
         self._runner = BoardRunner(
             self._board,
             self._port,
-            self._on_air,
-            self._on_command,
+            lambda stamp, air: self._keep(topics.TWIN_CHAMBER_PRESSURES, stamp, air.tolist()),
+            partial(self._keep, topics.TWIN_BOARD_COMMANDS),
             settings.real_time_priority,
             settings.reset_on_open,
         )
         self._runner.set_faults(faults)
         self.add_on_set_parameters_callback(self._on_parameters)
         self._runner.start()
-        DiagnosticsPublisher(self, self._report, hardware_id=str(self._port.link))
+        DiagnosticsPublisher(self, self._report, hardware_id=self._port.link)
         self.create_timer(0.2, self._watch)
         self.get_logger().info(f"{settings.protocol} board on {self._port.link}")
 
@@ -79,12 +79,8 @@ class BoardEmulator(Node):
                 self.get_logger().info(f"faults: {parameter.value or 'none'}")
         return SetParametersResult(successful=True)
 
-    def _on_air(self, stamp: int, pressure: NDArray[np.float64]) -> None:
-        self._unpublished.append((topics.TWIN_CHAMBER_PRESSURES, stamp, pressure.tolist()))
-        self._guard.trigger()
-
-    def _on_command(self, command: ReceivedCommand) -> None:
-        self._unpublished.append((topics.TWIN_BOARD_COMMANDS, command.stamp, command.pressure))
+    def _keep(self, topic: str, stamp: int, pressure: Sequence[float]) -> None:
+        self._unpublished.append((topic, stamp, pressure))
         self._guard.trigger()
 
     def _publish(self) -> None:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 from pressure_driver.emulator import BoardCommand, BoardProtocol, BoardReading
 from pressure_driver.following import Duration
-from pressure_driver.protocols import festo, pneudrive
+from pressure_driver.protocols import festo
+from pressure_driver.protocols.pneudrive import PneudriveEnd
 from pressure_driver.settings import EmulatorSettings
 
 BUS_PATIENCE = 1.0
@@ -30,7 +31,7 @@ class Slot:
 
     def tell(self, word: int) -> None:
         """Take over the first register of the slot."""
-        mode, control = word & 0x3F, word >> 6
+        mode, control = word & 0x3F, word >> 6 & 3
         if mode in (festo.ACKNOWLEDGE, festo.INACTIVE):
             self.mode, self.state = festo.INACTIVE, TO_BE_CONFIGURED
         elif (mode, control, self.mode) == (festo.REGULATE, festo.BOTH_VALVES, festo.INACTIVE):
@@ -47,11 +48,7 @@ class FestoBoard(BoardProtocol):
     """The terminal's end of ``festo``."""
 
     gauge = True
-
-    def __init__(self, chamber_count: int = 4) -> None:
-        super().__init__(chamber_count, festo.ModbusReader())
-        self._motion_terminal = True
-        self.boot(0.0)
+    _motion_terminal = True
 
     def configure(self, settings: EmulatorSettings) -> None:
         """Take over which valves the terminal has."""
@@ -64,12 +61,15 @@ class FestoBoard(BoardProtocol):
         self._outputs = [0] * (3 * len(self.slots) or self.chamber_count)
         return b""
 
-    def _interpret(self, place: int, frame: festo.ModbusFrame) -> BoardCommand:
+    def _cut(self) -> Iterator[festo.ModbusFrame | None]:
+        return festo.cut_frames(self._kept)
+
+    def _interpret(self, frame: festo.ModbusFrame) -> list[BoardCommand]:
         """Return a read or a write; what is not there comes back as ``refused``."""
         function, data, number = frame.function, frame.data, frame.transaction
         first, count = festo.BLOCK.unpack(data[:4].ljust(4, b"\0"))
         if function == festo.READ:
-            return BoardCommand("read", place, sequence=number, text=f"{first} {count}")
+            return [BoardCommand("read", sequence=number, text=f"{first} {count}")]
         words, offset = festo.to_words(data[5:]), first - festo.FIRST_OUTPUT
         inside = 0 <= offset <= len(self._outputs) - count
         if function == festo.WRITE and inside and len(words) == count:
@@ -77,19 +77,14 @@ class FestoBoard(BoardProtocol):
             for slot, word in zip(self.slots, self._outputs[0::3], strict=False):
                 slot.tell(word)
             told = self._setpoints()
-            return BoardCommand("setpoint", place, told, BUS_PATIENCE, number, f"{first} {count}")
-        self._frames.rejected += 1
+            return [BoardCommand("setpoint", told, BUS_PATIENCE, number, f"{first} {count}")]
+        self.rejected += 1
         problem = ILLEGAL_ADDRESS if function == festo.WRITE else ILLEGAL_FUNCTION
-        return BoardCommand("refused", place, sequence=number, text=f"{function} {problem}")
+        return [BoardCommand("refused", sequence=number, text=f"{function} {problem}")]
 
     def _setpoints(self) -> tuple[float, ...]:
         values = [v for place, v in enumerate(self._outputs) if place % 3 or not self.slots]
-        millibar = (festo.signed(value) for value in values)
-        # Regulators of an MPA terminal that are told less than nothing open wide.
-        wild = 0 if self.slots else festo.LARGEST_SETPOINT
-        return tuple(
-            festo.PASCAL_PER_MILLIBAR * (value if value >= 0 else wild) for value in millibar
-        )
+        return tuple(festo.PASCAL_PER_MILLIBAR * value for value in values)
 
     def target(self, pressure: Sequence[float], time: float) -> Sequence[float]:
         """Return setpoints of slots that run; the others are vented."""
@@ -132,22 +127,14 @@ class FestoBoard(BoardProtocol):
         return self.boot(0.0)
 
 
-class PneudriveBoard(BoardProtocol):
+class PneudriveBoard(PneudriveEnd, BoardProtocol):
     """The board's end of ``pneudrive``."""
 
     gauge = True
-    _frames: pneudrive.Frames
 
-    def __init__(self, chamber_count: int = 4) -> None:
-        super().__init__(chamber_count, pneudrive.Frames(chamber_count))
-
-    def configure(self, settings: EmulatorSettings) -> None:
-        """Take over the board's number and the range of its sensors."""
-        self._frames.configure(settings)
-
-    def _interpret(self, place: int, gauge: tuple[float, ...]) -> BoardCommand:
+    def _interpret(self, gauge: tuple[float, ...]) -> list[BoardCommand]:
         """Return targets."""
-        return BoardCommand("setpoint", place, pressure=gauge)
+        return [BoardCommand("setpoint", gauge)]
 
     def target(self, pressure: Sequence[float], time: float) -> Sequence[float]:
         """Return the targets; nothing while the board starts."""
@@ -155,4 +142,4 @@ class PneudriveBoard(BoardProtocol):
 
     def reply(self, command: BoardCommand, reading: BoardReading) -> bytes:  # noqa: ARG002
         """What the board measures, in the layout of its targets."""
-        return self._frames.encode([p - reading.atmosphere for p in reading.chamber_pressure])
+        return self.encode([p - reading.atmosphere for p in reading.chamber_pressure])

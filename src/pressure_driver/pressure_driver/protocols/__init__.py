@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -107,91 +107,87 @@ class BoardIdentity:
 Event = Telemetry | Echo | BoardFailure | BoardReset | BoardText | BoardIdentity
 
 
-class FrameBuffer(ABC):
-    """Bytes that are cut into frames or lines, and how often some were thrown away."""
-
-    def __init__(self) -> None:
-        self.rejected = 0
-        """Places at which bytes had to be skipped, and frames or lines that were damaged."""
-        self.position = 0
-        """Of the first byte that is kept, in the stream."""
-        self.kept = bytearray()
-
-    @abstractmethod
-    def feed(self, data: bytes) -> list[tuple[int, Any]]:
-        """Return (place of the first byte, frame) of what became complete; None for damage."""
-
-    def take(self, count: int) -> bytes:
-        """Return the first bytes and forget them."""
-        taken = bytes(self.kept[:count])
-        del self.kept[:count]
-        self.position += len(taken)
-        return taken
-
-    def skip_to(self, begin: int) -> None:
-        """Skip bytes that are no frame, up to a place or, if it is not behind them, all of them."""
-        self.rejected += 1
-        self.take(begin if begin > 0 else len(self.kept))
-
-    def reset(self) -> None:
-        """Forget a half-received frame."""
-        self.take(len(self.kept))
-
-
-class StreamCutter(FrameBuffer):
-    """Cuts a stream into pieces at the byte that ends each of them.
+def cut_at(end: bytes, longest: int, kept: bytearray) -> list[bytes | None]:
+    """Take the pieces of a stream that are complete.
 
     Args:
         end: the byte after each piece.
-        longest: bytes; of a longer piece everything up to its end is dropped.
+        longest: bytes; a longer piece counts as damaged, and its bytes are not kept.
+        kept: what has come and is not taken yet; an unfinished piece stays there.
+
+    Returns:
+        The pieces without their ends; None for a damaged one.
     """
-
-    def __init__(self, end: bytes, longest: int) -> None:
-        super().__init__()
-        self._end = end
-        self._longest = longest
-
-    def feed(self, data: bytes) -> list[tuple[int, Any]]:
-        """Return (place of the first byte, bytes without their end); None for too many."""
-        pieces: list[tuple[int, bytes | None]] = []
-        self.kept += data
-        while (end := self.kept.find(self._end)) >= 0:
-            place, piece = self.position, self.take(end + 1)[:-1]
-            pieces.append((place, piece if end <= self._longest else None))
-        # One byte more than allowed is enough to know later that there were too many.
-        self.take(max(len(self.kept) - self._longest - 1, 0))
-        return pieces
+    *pieces, rest = kept.split(end)
+    # One byte more than allowed is enough to know later that there were too many.
+    kept[:] = rest[-longest - 1 :]
+    return [bytes(piece) if len(piece) <= longest else None for piece in pieces]
 
 
-class LineSplitter(StreamCutter):
-    """Collects bytes and returns complete lines with the place of their first byte.
+def skip_to(begin: int, kept: bytearray) -> None:
+    """Drop bytes that are no frame, up to a place or, if it is not behind them, all of them."""
+    del kept[: begin if begin > 0 else len(kept)]
+
+
+def cut_lines(kept: bytearray) -> Iterator[str | None]:
+    """Take the lines that are complete; None for a damaged one.
 
     Lines end with a line feed; carriage returns and blanks at either end are dropped, and so are
     empty lines. Bytes outside printable ASCII (and tab) make a line damaged.
     """
-
-    def __init__(self) -> None:
-        super().__init__(b"\n", LONGEST_LINE)
-
-    def feed(self, data: bytes) -> list[tuple[int, str | None]]:
-        """Return (place of the first byte, text) of the complete lines; None for a damaged one."""
-        lines: list[tuple[int, str | None]] = []
-        for start, raw in super().feed(data):
-            text = (raw or b"").strip()
-            if raw is None or any(byte != 9 and not 32 <= byte < 127 for byte in text):
-                lines.append((start, None))
-            elif text:
-                lines.append((start + len(raw) - len(raw.lstrip()), text.decode("ascii")))
-        return lines
+    for raw in cut_at(b"\n", LONGEST_LINE, kept):
+        text = (raw or b"").strip()
+        if raw is None or any(byte != 9 and not 32 <= byte < 127 for byte in text):
+            yield None
+        elif text:
+            yield text.decode("ascii")
 
 
-class HostProtocol(ABC):
-    """The driver's end: encodes commands, decodes what the board says.
+class ProtocolEnd(ABC):
+    """One end of a language: what it hears is cut into frames or lines, and interpreted.
 
     Args:
         chamber_count: 2M, at most 32.
-        frames: cuts what the board sends.
     """
+
+    def __init__(self, chamber_count: int = 4) -> None:
+        self.chamber_count = chamber_count
+        self.rejected = 0
+        """Frames or lines that were damaged, and places at which bytes had to be skipped."""
+        self._kept = bytearray()
+        """Bytes of what is not complete yet."""
+        self.number: int | None = None
+        """Of the newest frame to the other end; None where frames have no numbers."""
+
+    def configure(self, settings: Any) -> None:  # noqa: B027 - most boards have no parameters
+        """Take over the parameters that are for this board alone."""
+
+    def decode(self, data: bytes) -> list[Any]:
+        """Take the next bytes of the stream; return what complete frames say. Never raises."""
+        self._kept += data
+        said: list[Any] = []
+        for frame in self._cut():
+            found = [] if frame is None else self._interpret(frame)
+            self.rejected += not found
+            said += found
+        return said
+
+    def _next(self) -> int:
+        """Return the number of the next frame, modulo 65536."""
+        self.number = ((self.number or 0) + 1) & 0xFFFF
+        return self.number
+
+    @abstractmethod
+    def _cut(self) -> Iterable[Any]:
+        """Take what is complete from the bytes that are kept; None for damage."""
+
+    @abstractmethod
+    def _interpret(self, frame: Any) -> list[Any]:
+        """Return what a frame or a line says; nothing: it is damaged."""
+
+
+class HostProtocol(ProtocolEnd):
+    """The driver's end: encodes commands, decodes what the board says: each an `Event`."""
 
     name: ClassVar[str]
     baud_rate: ClassVar[int] = 115200
@@ -199,8 +195,6 @@ class HostProtocol(ABC):
     """What the protocol cannot protect from; shown in the diagnostics."""
     reports_supply: ClassVar[bool] = False
     has_watchdog: ClassVar[bool] = False
-    introduces_itself: ClassVar[bool] = False
-    """Whether the board answers `start` with a `BoardIdentity`."""
     separator: ClassVar[bytes] = b"\n"
     """What makes the board drop or finish whatever was sent by halves."""
     echoes: ClassVar[bool] = False
@@ -218,26 +212,17 @@ class HostProtocol(ABC):
     room: Callable[[], float]
     """[Pa] absolute, of the atmosphere, where the wire wants absolute pressures."""
 
-    def __init__(self, chamber_count: int, frames: FrameBuffer) -> None:
-        self.chamber_count = chamber_count
-        self._frames = frames
+    def __init__(self, chamber_count: int = 4) -> None:
+        super().__init__(chamber_count)
         self.clock, self.room = time.monotonic, lambda: STANDARD_ATMOSPHERE
         self.last_damaged = ""
-        """The newest of them, where the protocol has lines."""
+        """The newest damaged line, where the protocol has lines."""
         self.unsettled = ""
         """Why no pressure may be commanded yet, though the board talks; empty if it may."""
         self._follow_up = b""
-        self._number = 0
+        self.reset()
 
-    @property
-    def rejected(self) -> int:
-        """Frames or lines that were damaged and thrown away."""
-        return self._frames.rejected
-
-    def configure(self, settings: Settings) -> None:  # noqa: B027 - most boards have no parameters
-        """Take over the parameters that are for this board alone."""
-
-    def doubt(self) -> None:  # noqa: B027 - most boards have no settings
+    def doubt(self) -> None:
         """Trust no setting of the board any more, as after it has been silent."""
 
     @abstractmethod
@@ -245,17 +230,14 @@ class HostProtocol(ABC):
         """Return what a board must be sent after the port has opened."""
 
     @abstractmethod
-    def setpoint(self, gauge: Sequence[float]) -> tuple[bytes, int | None]:
+    def setpoint(self, gauge: Sequence[float]) -> bytes:
         """Encode one command.
 
         Args:
             gauge: (2M,) [Pa] of each valve, within the driver's limits.
-
-        Returns:
-            The bytes, and the number that the board's echo will carry (None: it has no numbers).
         """
 
-    def vent(self) -> tuple[bytes, int | None]:
+    def vent(self) -> bytes:
         """Encode the command that opens every chamber to the atmosphere, or regulates to it."""
         return self.setpoint([0.0] * self.chamber_count)
 
@@ -264,41 +246,23 @@ class HostProtocol(ABC):
 
         It is complete after any half-sent bytes.
         """
-        return self.separator + self.vent()[0]
-
-    def _next(self) -> int:
-        """Return the number of the next frame, modulo 65536, for protocols that have numbers."""
-        self._number = (self._number + 1) & 0xFFFF
-        return self._number
+        return self.separator + self.vent()
 
     def follow_up(self) -> bytes:
         """Return what is to be sent at once because of what has been decoded."""
         data, self._follow_up = self._follow_up, b""
         return data
 
-    def decode(self, data: bytes) -> list[Event]:
-        """Take the next bytes of the stream and return what became complete. Never raises."""
-        events: list[Event] = []
-        for _, frame in self._frames.feed(data):
-            found = [] if frame is None else self._interpret(frame)
-            self._frames.rejected += not found
-            events += found
-        return events
-
-    @abstractmethod
-    def _interpret(self, frame: Any) -> list[Event]:
-        """Return what a frame or a line says; nothing: it is damaged."""
-
     def reset(self) -> None:
         """Forget half-received bytes and what the board has said, as after a reconnect."""
-        self._frames.reset()
+        self._kept.clear()
 
 
 class LineHost(HostProtocol):
     """The driver's end of a protocol whose board sends text lines."""
 
-    def __init__(self, chamber_count: int = 4) -> None:
-        super().__init__(chamber_count, LineSplitter())
+    def _cut(self) -> Iterator[str | None]:
+        return cut_lines(self._kept)
 
     def _interpret(self, line: str) -> list[Event]:
         event = self._parse(line)
@@ -312,13 +276,10 @@ class LineHost(HostProtocol):
         """Return what a line says; None: it is damaged."""
 
 
-def host_protocol(
-    name: str, chamber_count: int = 4, settings: Settings | None = None
-) -> HostProtocol:
-    """Return the driver's end of one of the `NAMES`; only its module is loaded."""
-    module = import_module(f"pressure_driver.protocols.{name}")
-    host: Callable[[int], HostProtocol] = getattr(module, f"{name.capitalize()}Host")
-    protocol = host(chamber_count)
-    if settings is not None:
-        protocol.configure(settings)
+def host_protocol(settings: Settings) -> HostProtocol:
+    """Return the driver's end of the language that is chosen; only its module is loaded."""
+    module = import_module(f"pressure_driver.protocols.{settings.protocol}")
+    host: type[HostProtocol] = getattr(module, f"{settings.protocol.capitalize()}Host")
+    protocol = host(2 * settings.segment_count)
+    protocol.configure(settings)
     return protocol

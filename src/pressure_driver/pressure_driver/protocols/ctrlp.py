@@ -56,11 +56,6 @@ class CtrlpHost(LineHost):
     )
     echoes = True
 
-    def __init__(self, chamber_count: int = 4) -> None:
-        super().__init__(chamber_count)
-        self.unsettled = _UNITS_UNKNOWN
-        self._times: deque[int] = deque(maxlen=4)
-
     def doubt(self) -> None:
         """Have the units confirmed again before the next setpoint."""
         self.unsettled = _UNITS_UNKNOWN
@@ -68,21 +63,21 @@ class CtrlpHost(LineHost):
     def reset(self) -> None:
         """Forget a half-received line and everything that the board has confirmed."""
         super().reset()
-        self._times.clear()
+        self._times = deque[int](maxlen=4)
         self.doubt()
 
     def start(self) -> bytes:
         """Echoes on, kPa, ramps between setpoints, reports at 20 Hz."""
         return b"\nECHO;1\nUNITS;1\nMODE;3\nTIME;50\nON\n"
 
-    def setpoint(self, gauge: Sequence[float]) -> tuple[bytes, int | None]:
+    def setpoint(self, gauge: Sequence[float]) -> bytes:
         """Encode one gauge pressure a channel in kPa, to 1 Pa."""
         numbers = ";".join(f"{value / PASCAL_PER_KILOPASCAL:.3f}" for value in gauge)
-        return f"SET;{RAMP_TIME:.3f};{numbers}\n".encode(), None
+        return f"SET;{RAMP_TIME:.3f};{numbers}\n".encode()
 
-    def vent(self) -> tuple[bytes, int | None]:
+    def vent(self) -> bytes:
         """Zero gauge pressure on every channel, without a ramp."""
-        return ("SET;0.000" + ";0.000" * self.chamber_count + "\n").encode(), None
+        return ("SET;0.000" + ";0.000" * self.chamber_count + "\n").encode()
 
     def decode(self, data: bytes) -> list[Event]:
         """Return what complete lines say; a clock that has gone back is a reset."""

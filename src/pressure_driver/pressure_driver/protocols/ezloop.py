@@ -53,15 +53,11 @@ class EzloopHost(LineHost):
     tells_pascals = True
     reach = LARGEST_WIRE_VALUE * PASCAL_PER_HECTOPASCAL
 
-    def __init__(self, chamber_count: int = 4) -> None:
-        super().__init__(chamber_count)
-        self._reporting = False
-
     def start(self) -> bytes:
         """A line end, which finishes whatever an earlier program left half-sent."""
         return b"\n"
 
-    def setpoint(self, gauge: Sequence[float]) -> tuple[bytes, int | None]:
+    def setpoint(self, gauge: Sequence[float]) -> bytes:
         """Encode differences as pairs of absolute pressures, to 1 Pa.
 
         A pair that would pass 1250 hPa is sent lower as a pair: the board only reads differences.
@@ -72,7 +68,7 @@ class EzloopHost(LineHost):
             low = min(room, LARGEST_WIRE_VALUE - max(sizes))
             low = math.floor(low * 100.0) / 100.0
             values += [low + round(size, 2) for size in sizes]
-        return ("<" + ",".join(f"{value:.2f}" for value in values) + ">\n").encode(), None
+        return ("<" + ",".join(f"{value:.2f}" for value in values) + ">\n").encode()
 
     def _parse(self, line: str) -> Event | None:
         tag, separator, rest = line.partition(":")

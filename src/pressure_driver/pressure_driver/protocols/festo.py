@@ -27,16 +27,16 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 from pressure_driver.protocols import (
     BoardFailure,
     Echo,
     Event,
-    FrameBuffer,
     HostProtocol,
     Telemetry,
+    skip_to,
 )
 
 if TYPE_CHECKING:
@@ -91,36 +91,28 @@ def to_bytes(words: Iterable[int]) -> bytes:
 
 
 def to_words(data: bytes) -> tuple[int, ...]:
-    """Return registers, 0 … 65535; half a register at the end is left out."""
-    return struct.unpack_from(f">{len(data) // 2}H", data)
+    """Return registers as numbers with sign; half a register at the end is left out."""
+    return struct.unpack_from(f">{len(data) // 2}h", data)
 
 
-def signed(word: int) -> int:
-    """Return a register as a number of 16 bits with sign."""
-    return word - 0x10000 if word & 0x8000 else word
-
-
-class ModbusReader(FrameBuffer):
-    """Cuts a byte stream into frames.
+def cut_frames(kept: bytearray) -> Iterator[ModbusFrame | None]:
+    """Take complete frames.
 
     TCP loses and changes nothing. What does not begin as a frame is skipped to where one may begin.
     """
-
-    def feed(self, data: bytes) -> list[tuple[int, ModbusFrame]]:
-        """Return (place of the first byte, frame) of those that became complete."""
-        frames: list[tuple[int, ModbusFrame]] = []
-        self.kept += data
-        while len(self.kept) >= HEADER.size:
-            transaction, zero, length, _, function = HEADER.unpack_from(self.kept)
-            if zero or not 2 < length <= LONGEST_LENGTH:
-                # The two zero bytes stand behind the transaction.
-                self.skip_to(self.kept.find(b"\0\0", 3) - 2)
-                continue
-            if len(self.kept) < LENGTH_BEGINS + length:
-                break
-            place, frame = self.position, self.take(LENGTH_BEGINS + length)
-            frames.append((place, ModbusFrame(transaction, function, frame[HEADER.size :])))
-        return frames
+    while len(kept) >= HEADER.size:
+        transaction, zero, length, _, function = HEADER.unpack_from(kept)
+        if zero or not 2 < length <= LONGEST_LENGTH:
+            # The two zero bytes stand behind the transaction.
+            skip_to(kept.find(b"\0\0", 3) - 2, kept)
+            yield None
+            continue
+        end = LENGTH_BEGINS + length
+        if len(kept) < end:
+            break
+        data = bytes(kept[HEADER.size : end])
+        del kept[:end]
+        yield ModbusFrame(transaction, function, data)
 
 
 def slot_word(mode: int, control: int) -> int:
@@ -142,10 +134,7 @@ class FestoHost(HostProtocol):
     echoes = True
     resolution = PASCAL_PER_MILLIBAR
 
-    def __init__(self, chamber_count: int = 4) -> None:
-        super().__init__(chamber_count, ModbusReader())
-        self._motion_terminal = True
-        self.reset()
+    _motion_terminal = True
 
     def configure(self, settings: Settings) -> None:
         """Take over which valves the terminal has."""
@@ -155,9 +144,10 @@ class FestoHost(HostProtocol):
         """Forget a half-received frame and whether the valves run."""
         super().reset()
         self._follow_up = b""
-        self._sound = self._acknowledging = False
+        self._sound: bool | None = None
+        """Whether all valves ran at the last report; None before the first."""
+        self._acknowledging = False
         self._started_at = -math.inf
-        self._modes: set[int] = set()
         self.doubt()
 
     def doubt(self) -> None:
@@ -172,16 +162,16 @@ class FestoHost(HostProtocol):
         They are asked first: a terminal that runs already is vented and not started again.
         """
         now = self.clock()
-        if self._modes and not self._sound and now - self._started_at > START_TIME:
+        if self._sound is False and now - self._started_at > START_TIME:
             self._started_at = now
             self._acknowledging = self._motion_terminal
         return b""
 
-    def setpoint(self, gauge: Sequence[float]) -> tuple[bytes, int | None]:
+    def setpoint(self, gauge: Sequence[float]) -> bytes:
         """Encode one write of all setpoints to 1 mbar; its answer brings the question."""
         millibar = (round(value / PASCAL_PER_MILLIBAR) for value in gauge)
         values = [min(max(value, 0), LARGEST_SETPOINT) for value in millibar]
-        return self._write(values, self._acknowledging), self._number
+        return self._write(values, self._acknowledging)
 
     def emergency(self) -> bytes:
         """Regulate to the room's pressure, also where slots are being acknowledged."""
@@ -204,6 +194,9 @@ class FestoHost(HostProtocol):
 
     # ----------------------------------------------------------------------- from the terminal
 
+    def _cut(self) -> Iterator[ModbusFrame | None]:
+        return cut_frames(self._kept)
+
     def _interpret(self, frame: ModbusFrame) -> list[Event]:
         if frame.function == WRITE and len(frame.data) == BLOCK.size:
             block = BLOCK.pack(FIRST_INPUT, INPUTS * self._places)
@@ -222,8 +215,8 @@ class FestoHost(HostProtocol):
     def _slots(self, words: Sequence[int]) -> list[Event]:
         """Read slots of a motion terminal, and go on with their start."""
         status = words[0::INPUTS]
-        self._modes = {word & 0x3F for word in status}
-        if self._modes == {INACTIVE} and self.clock() - self._started_at >= ACKNOWLEDGE_TIME:
+        modes = {word & 0x3F for word in status}
+        if modes == {INACTIVE} and self.clock() - self._started_at >= ACKNOWLEDGE_TIME:
             self._acknowledging = False
         problem = ""
         for slot, word in enumerate(status):
@@ -231,14 +224,13 @@ class FestoHost(HostProtocol):
             if (mode, state) != (REGULATE, RUNNING):
                 problem = problem or (
                     f"slot {slot} does not run: mode {mode}, state {state} ({STATES[state]}), "
-                    f"application {word >> 8}"
+                    f"application {word >> 8 & 0xFF}"
                 )
         pressures = [words[place] for place in range(len(words)) if place % INPUTS]
         return self._judge(problem, pressures)
 
     def _regulators(self, words: Sequence[int]) -> list[Event]:
         """Read regulators of an MPA terminal."""
-        self._modes = {REGULATE}
         diagnoses = enumerate(words[2::INPUTS])
         found = [f"valve {valve} reports: diagnosis {code}" for valve, code in diagnoses if code]
         return self._judge("; ".join(found), words[0::INPUTS])
@@ -250,6 +242,6 @@ class FestoHost(HostProtocol):
         if self._sound:
             self._acknowledging = False
             self._started_at = -math.inf  # whatever fails next is started again at once
-        gauge = (PASCAL_PER_MILLIBAR * signed(word) for word in pressures)
+        gauge = (PASCAL_PER_MILLIBAR * millibar for millibar in pressures)
         readings = tuple(self.assumed_atmosphere + value for value in gauge)
         return [*events, Telemetry(chamber_pressure=readings)]

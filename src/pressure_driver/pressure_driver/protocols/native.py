@@ -25,8 +25,8 @@ from pressure_driver.protocols import (
     Echo,
     Event,
     HostProtocol,
-    StreamCutter,
     Telemetry,
+    cut_at,
 )
 
 if TYPE_CHECKING:
@@ -39,10 +39,9 @@ SETPOINT_HEAD = struct.Struct("<H")
 STATUS_HEAD = struct.Struct("<IHBII")
 LONGEST_FRAME = 256
 """[bytes] as coded; a longer one is garbage."""
-VALIDITY = 250
-"""[ms] for which a setpoint holds, where nothing else is said."""
 LONGEST_VALIDITY = 60_000
 """[ms] A setpoint may stay valid at most this long."""
+_UNKNOWN = "the board has not introduced itself yet"
 
 
 def crc16(data: bytes) -> int:
@@ -113,15 +112,9 @@ def encode(kind: FrameType, sequence: int, body: bytes = b"") -> bytes:
     return seal(HEADER.pack(VERSION, kind, sequence & 0xFFFF) + body)
 
 
-class FrameSplitter(StreamCutter):
-    """Cuts a byte stream into frames of this version and of known type."""
-
-    def __init__(self) -> None:
-        super().__init__(b"\0", LONGEST_FRAME)
-
-    def feed(self, data: bytes) -> list[tuple[int, Frame | None]]:
-        """Return (place of the first byte, frame); None for one that is damaged or not known."""
-        return [(place, _read(coded)) for place, coded in super().feed(data) if coded != b""]
+def cut_frames(kept: bytearray) -> list[Frame | None]:
+    """Take complete frames; None for one that is damaged, of another version or unknown type."""
+    return [_read(coded) for coded in cut_at(b"\0", LONGEST_FRAME, kept) if coded != b""]
 
 
 def _read(coded: bytes | None) -> Frame | None:
@@ -141,14 +134,10 @@ class NativeHost(HostProtocol):
     reports_supply = True
     tells_pascals = True
     has_watchdog = True
-    introduces_itself = True
     separator = b"\0"
     echoes = True
 
-    def __init__(self, chamber_count: int = 4) -> None:
-        super().__init__(chamber_count, FrameSplitter())
-        self._board_time: int | None = None
-        self._validity = VALIDITY
+    _board_time: int | None
 
     def configure(self, settings: Settings) -> None:
         """Take over how long a command holds."""
@@ -158,17 +147,18 @@ class NativeHost(HostProtocol):
         """A zero byte, which ends whatever was half-sent, and HELLO."""
         return b"\0" + encode(FrameType.HELLO, self._next())
 
-    def setpoint(self, gauge: Sequence[float]) -> tuple[bytes, int | None]:
+    def setpoint(self, gauge: Sequence[float]) -> bytes:
         """Encode one gauge pressure a chamber, and how long they hold."""
         body = SETPOINT_HEAD.pack(self._validity)
         body += struct.pack(f"<{len(gauge)}i", *map(round, gauge))
-        sequence = self._next()
-        return encode(FrameType.SETPOINT, sequence, body), sequence
+        return encode(FrameType.SETPOINT, self._next(), body)
 
-    def vent(self) -> tuple[bytes, int | None]:
+    def vent(self) -> bytes:
         """Encode VENT, which holds until the next SETPOINT."""
-        sequence = self._next()
-        return encode(FrameType.VENT, sequence), sequence
+        return encode(FrameType.VENT, self._next())
+
+    def _cut(self) -> list[Frame | None]:
+        return cut_frames(self._kept)
 
     def _interpret(self, frame: Frame) -> list[Event]:
         if frame.type is FrameType.IDENTITY:
@@ -190,6 +180,7 @@ class NativeHost(HostProtocol):
         text = body[HELLO_BODY.size :]
         if len(text) != length or low > high:
             return []
+        self.unsettled = ""
         return [BoardIdentity(count, float(high), text.decode("ascii", "replace"))]
 
     def _status(self, body: bytes) -> list[Event]:
@@ -215,9 +206,11 @@ class NativeHost(HostProtocol):
         last, self._board_time = self._board_time, time
         if last is None or (time - last) & 0xFFFFFFFF < 0x80000000:
             return []
+        self.unsettled = _UNKNOWN
         return [BoardReset("its clock has gone back")]
 
     def reset(self) -> None:
-        """Forget a half-received frame, and the board's clock."""
+        """Forget a half-received frame, the board's clock and that it has introduced itself."""
         super().reset()
+        self.unsettled = _UNKNOWN
         self._board_time = None

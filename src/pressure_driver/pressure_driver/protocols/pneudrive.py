@@ -13,10 +13,17 @@ vents for 2 s at its start.
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
-from pressure_driver.protocols import Echo, Event, FrameBuffer, HostProtocol, Telemetry
+from pressure_driver.protocols import (
+    Echo,
+    Event,
+    HostProtocol,
+    ProtocolEnd,
+    Telemetry,
+    skip_to,
+)
 
 if TYPE_CHECKING:
     from pressure_driver.settings import EmulatorSettings, Settings
@@ -28,52 +35,44 @@ VALVES = 4
 LARGEST_COUNT = 1023
 NOMINAL_RANGE = 689_500.0
 """[Pa] of the sensors with 100 psi."""
-_STEPS, _ZERO, _SPAN = 1024, 0.1, 0.8
+ZERO, COUNTS = 102.4, 819.2
+"""Counts of no pressure, and between that and the range of the sensors."""
 
 
-class Frames(FrameBuffer):
-    """Between gauge pressures and frames: the address, and four numbers of counts.
+class PneudriveEnd(ProtocolEnd):
+    """Either end: frames of an address and four numbers of counts."""
 
-    Args:
-        chamber_count: at most `VALVES`.
-    """
-
-    def __init__(self, chamber_count: int) -> None:
-        super().__init__()
-        self._count = chamber_count
-        self._address, self._range = FIRST_ADDRESS, NOMINAL_RANGE
+    _address = FIRST_ADDRESS
+    reach = NOMINAL_RANGE
+    """[Pa] of the sensors."""
+    resolution = NOMINAL_RANGE / COUNTS
+    """[Pa] of a count."""
 
     def configure(self, settings: Settings | EmulatorSettings) -> None:
         """Take over the board's number and the range of its sensors."""
-        self._address, self._range = FIRST_ADDRESS - settings.device, settings.sensor_range
-
-    @property
-    def resolution(self) -> float:
-        """[Pa] of a count."""
-        return self._range / (_STEPS * _SPAN)
+        self._address = FIRST_ADDRESS - settings.device
+        self.reach, self.resolution = settings.sensor_range, settings.sensor_range / COUNTS
 
     def encode(self, gauge: Sequence[float]) -> bytes:
         """Return a frame of gauge pressures [Pa]; valves without a chamber have none."""
-        padded = [*gauge, *[0.0] * (VALVES - self._count)]
-        counts = [round(_STEPS * _ZERO + value / self.resolution) for value in padded]
+        padded = [*gauge, *[0.0] * (VALVES - self.chamber_count)]
+        counts = [round(ZERO + value / self.resolution) for value in padded]
         return FRAME.pack(self._address, *(min(max(count, 0), LARGEST_COUNT) for count in counts))
 
-    def feed(self, data: bytes) -> list[tuple[int, tuple[float, ...]]]:
-        """Return (place of the first byte, gauge pressures [Pa]) of complete frames."""
-        found: list[tuple[int, tuple[float, ...]]] = []
-        self.kept += data
-        while len(self.kept) >= FRAME.size:
-            address, *counts = FRAME.unpack_from(self.kept)
+    def _cut(self) -> Iterator[tuple[float, ...] | None]:
+        """Take the gauge pressures [Pa] of complete frames."""
+        kept = self._kept
+        while len(kept) >= FRAME.size:
+            address, *counts = FRAME.unpack_from(kept)
             if address == self._address and max(counts) <= LARGEST_COUNT:
-                pressures = [self.resolution * (n - _STEPS * _ZERO) for n in counts]
-                found.append((self.position, tuple(pressures[: self._count])))
-                self.take(FRAME.size)
+                del kept[: FRAME.size]
+                yield tuple(self.resolution * (n - ZERO) for n in counts[: self.chamber_count])
             else:
-                self.skip_to(self.kept.find(b"\xff", 1))
-        return found
+                skip_to(kept.find(b"\xff", 1), kept)
+                yield None
 
 
-class PneudriveHost(HostProtocol):
+class PneudriveHost(PneudriveEnd, HostProtocol):
     """The driver's end of ``pneudrive``."""
 
     name = "pneudrive"
@@ -85,24 +84,14 @@ class PneudriveHost(HostProtocol):
     )
     separator = b""
     echoes = True
-    _frames: Frames
-
-    def __init__(self, chamber_count: int = 4) -> None:
-        super().__init__(chamber_count, Frames(chamber_count))
-        self.resolution = self._frames.resolution
-
-    def configure(self, settings: Settings) -> None:
-        """Take over the board's number and the range of its sensors."""
-        self._frames.configure(settings)
-        self.resolution, self.reach = self._frames.resolution, settings.sensor_range
 
     def start(self) -> bytes:
         """Nothing: the board speaks when it is spoken to."""
         return b""
 
-    def setpoint(self, gauge: Sequence[float]) -> tuple[bytes, int | None]:
+    def setpoint(self, gauge: Sequence[float]) -> bytes:
         """Encode the targets."""
-        return self._frames.encode(gauge), None
+        return self.encode(gauge)
 
     def _interpret(self, gauge: tuple[float, ...]) -> list[Event]:
         """Return what was measured, and that a command was answered."""

@@ -15,31 +15,22 @@ STALE = 0.2
 """[s] after which readings are not told any more."""
 
 
-class Scale:
-    """Between the numbers of a lab's topic and gauge pressures.
+def to_topic(gauge: Sequence[float], settings: TopicBoardSettings) -> list[float]:
+    """Return what a lab is told for gauge pressures (2M,) [Pa]."""
+    return [value * settings.scale + settings.offset for value in gauge]
 
-    Args:
-        settings: `scale` is what one Pa is on the topic, `offset` what is added to that.
+
+def from_topic(told: Sequence[float], settings: TopicBoardSettings) -> list[float]:
+    """Return gauge pressures (2M,) [Pa] for what a lab tells.
+
+    Raises:
+        ValueError: it does not tell one number for each chamber.
     """
-
-    def __init__(self, settings: TopicBoardSettings) -> None:
-        self._count = 2 * settings.segment_count
-        self._scale, self._offset = settings.scale, settings.offset
-
-    def to_topic(self, gauge: Sequence[float]) -> list[float]:
-        """Return what a lab is told for gauge pressures (2M,) [Pa]."""
-        return [value * self._scale + self._offset for value in gauge]
-
-    def from_topic(self, told: Sequence[float]) -> list[float]:
-        """Return gauge pressures (2M,) [Pa] for what a lab tells.
-
-        Raises:
-            ValueError: it does not tell one number for each chamber.
-        """
-        if len(told) != self._count or not all(map(math.isfinite, told)):
-            listed = ", ".join(f"{value:g}" for value in told)
-            raise ValueError(f"measured is {listed}: {self._count} numbers are expected")
-        return [(value - self._offset) / self._scale for value in told]
+    count = 2 * settings.segment_count
+    if len(told) != count or not all(map(math.isfinite, told)):
+        listed = ", ".join(f"{value:g}" for value in told)
+        raise ValueError(f"measured is {listed}: {count} numbers are expected")
+    return [(value - settings.offset) / settings.scale for value in told]
 
 
 class WatchedBoard:

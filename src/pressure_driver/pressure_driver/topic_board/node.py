@@ -19,10 +19,10 @@ from limb_interfaces import qos, topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
 from limb_interfaces.runner import run_node
 from pressure_driver.emulator.firmware import NativeBoard
-from pressure_driver.lines import BoardSocket
+from pressure_driver.emulator.line import BoardSocket
 from pressure_driver.node import read_settings
 from pressure_driver.settings import TopicBoardSettings
-from pressure_driver.topic_board import Scale, WatchedBoard
+from pressure_driver.topic_board import WatchedBoard, from_topic, to_topic
 
 LOOK = 0.005
 """[s] between two looks for bytes of the driver."""
@@ -35,8 +35,7 @@ class TopicBoard(Node):
 
     def __init__(self) -> None:
         super().__init__("topic_board", namespace=topics.NAMESPACE)
-        settings = read_settings(self, TopicBoardSettings)
-        self._scale = Scale(settings)
+        settings = self._settings = read_settings(self, TopicBoardSettings)
         self._count = 2 * settings.segment_count
         firmware = NativeBoard(self._count, round(settings.largest_pressure), known=0)
         self._board = WatchedBoard(firmware, self._publish)
@@ -64,7 +63,7 @@ class TopicBoard(Node):
         self._socket.pump(0)
 
     def _publish(self, gauge: Sequence[float]) -> None:
-        values = self._scale.to_topic(gauge)
+        values = to_topic(gauge, self._settings)
         header = Header(stamp=self.get_clock().now().to_msg())
         for publisher, value in zip(self._regulators, values, strict=False):
             publisher.publish(
@@ -81,7 +80,7 @@ class TopicBoard(Node):
         told = [value for _, values in sorted(self._told.items()) for value in values]
         self._told.clear()
         try:
-            gauge = self._scale.from_topic(told)
+            gauge = from_topic(told, self._settings)
         except ValueError as error:
             self._refused = str(error)
             return
