@@ -222,7 +222,7 @@ class Backend(ABC):
         """Return the numbers of the rod under a load (4N-1,) [N]."""
         return self.rod._replace(body=self.rod.body._replace(load=self.rates(load)))
 
-    def new_record(self, solves: int) -> Record:
+    def _new_record(self, solves: int) -> Record:
         """Return an unfilled record of so many solves."""
         band = (self.size, 5 * self.unknowns_per_node + 1)
         edges = self.turning_edges
@@ -237,9 +237,11 @@ class Backend(ABC):
 
     def simulate(
         self, place: Place, motion: tuple[Array, Array], pressures: Array, begin: int,
-        solver: Solver, load: Array, record: Record,
+        solver: Solver, load: Array, linearise: bool,
     ) -> Piece:  # fmt: skip
         """Run the kernel from step `begin` on; motion is where positions and velocities go."""
+        left = pressures.shape[0] * pressures.shape[1] - begin
+        record = self._new_record(left * len(solver.extrapolate) if linearise else 0)
         space = self.work_space(place.base)
         done, iterations, update, failed = self.kernels.simulate(
             motion, place, pressures, begin, solver, record, space, self.loaded(load)
