@@ -188,10 +188,6 @@ class ArcModel(Model):
         line = np.array(points)
         return np.column_stack([line.real, line.imag])
 
-    def _inertia(self, q: Array, v: Array) -> tuple[Array, Array, Array, Array]:
-        result: tuple[Array, Array, Array, Array] = kernels.inertia(q, v, self.arcs)
-        return result
-
     def elastic_torque(self, bend_angles: ArrayLike) -> Array:
         """Return the elastic torque (..., n) [N·m] that opposes bend angles (..., n) [rad]."""
         bend = np.asarray(bend_angles, dtype=float) - self.free_angles
@@ -214,7 +210,7 @@ class ArcModel(Model):
         if not self.arcs.gravity.any() and not self.cubic.any():
             return ArcState(q, still)
         for _ in range(_RESTING_STEPS):
-            pull = self._inertia(q, still)[3] + drive - self.elastic_torque(q)
+            _, pull = kernels.inertia_and_force(q, still, drive, self.arcs)
             values, vectors = np.linalg.eigh(self.stiffness_matrix(q))
             firm = np.maximum(np.abs(values), 1e-3 * self.stiffness.min())
             step = vectors @ ((vectors.T @ pull) / firm)
@@ -242,13 +238,10 @@ class ArcModel(Model):
             (K, n) differential pressures [Pa].
         """
         q, v, a = (
-            np.atleast_2d(np.asarray(x, dtype=float)) for x in (angles, rates, accelerations)
+            np.atleast_2d(np.ascontiguousarray(x, dtype=float))
+            for x in (angles, rates, accelerations)
         )
-        torque = self.elastic_torque(q) + self.stiffness * self.material_damping * v
-        for k in range(len(q)):
-            M, C, D, weight = self._inertia(q[k], v[k])
-            torque[k] += M @ a[k] + (C + D) @ v[k] - weight
-        pressures: Array = torque / self.gain
+        pressures: Array = kernels.needed_torque(q, v, a, self.arcs) / self.gain
         return pressures
 
     def static_pressure(self, bend_angles: ArrayLike) -> Array:
@@ -274,12 +267,11 @@ class ArcModel(Model):
         if inputs.ndim != 3 or inputs.shape[2] != self.segment_count:
             raise ValueError(f"pressures must be (K, S, {self.segment_count}), got {inputs.shape}")
         step, linear = period / inputs.shape[1], None
-        given = (start.angles, start.rates, inputs, step, self._parts(step), self.arcs)
+        angles, rates, by_state, by_pressure = kernels.simulate(
+            start.angles, start.rates, inputs, step, self._parts(step), self.arcs, bool(linearise)
+        )
         if linearise:
-            angles, rates, by_state, by_pressure = kernels.linearised(*given)
             linear = ArcFirstOrder(self.tip_jacobians(angles), by_state, by_pressure)
-        else:
-            angles, rates = kernels.simulate(*given)
         return Rollout(angles, self.tip(angles), ArcState(angles[-1], rates[-1]), linear=linear)
 
     def smallest_stiffness(self, bend_angles: ArrayLike) -> float:
@@ -296,8 +288,8 @@ class ArcModel(Model):
     def _parts(self, step: float) -> int:
         """Return in how many parts the integrator takes a step, by the fastest mode of the limb."""
         zero = np.zeros(self.segment_count)
-        M, _, D, _ = self._inertia(zero, zero)
-        drag = np.linalg.solve(M, D + np.diag(self.stiffness * self.material_damping))
+        _, damping, M = kernels.force_slopes(zero, zero, zero, self.arcs)
+        drag = np.linalg.solve(M, damping)
         stiff = np.linalg.solve(M, np.diag(self.stiffness))
         rates = np.block([[0 * M, np.eye(len(M))], [-stiff, -drag]])
         fastest = float(np.abs(np.linalg.eigvals(rates)).max())
