@@ -285,17 +285,22 @@ class Backend(ABC):
         x, space, _ = self.framed(state)
         return float(self.kernels.energy(x, space, self.rod))
 
-    def gradient_and_hessian(self, state: RodState) -> tuple[Array, Array]:
-        """Return ∇E (4N-1,) and ∇²E (4N-1, 4N-1), frames re-based at the state.
+    def internal_force(self, state: RodState) -> Array:
+        """Return the elastic and viscous force (4N-1,) of a moving state."""
+        return -self.full(self._assembled(state, self.rates(state.v))[0])
 
-        Entries off a plane are zero.
-        """
-        x, space, _ = self.framed(state)
-        gradient, still = np.zeros((2, self.size))
-        unpressed = np.zeros(len(self.mesh.gain))
-        self.kernels.assemble(x, still, 0.0, unpressed, False, gradient, space, self.rod)
+    def stiffness(self, state: RodState) -> Array:
+        """Return ∇²E (4N-1, 4N-1), frames re-based at the state; entries off a plane are zero."""
+        _, space = self._assembled(state, np.zeros(self.size))
         banded_kernel.expand(space.s, space.a)
-        return self.full(gradient), self.full_matrix(general_band_to_dense(space.a))
+        return self.full_matrix(general_band_to_dense(space.a))
+
+    def _assembled(self, state: RodState, v: Array) -> tuple[Array, Any]:
+        """Return ∇E with the viscous force at velocities v (n,), and the work space then."""
+        x, space, _ = self.framed(state)
+        gradient, unpressed = np.zeros(self.size), np.zeros(len(self.mesh.gain))
+        self.kernels.assemble(x, v, 0.0, unpressed, False, gradient, space, self.rod)
+        return gradient, space
 
     def input_matrix(self, state: RodState) -> Array:
         """Return B(q)Λ (4N-1, M)."""

@@ -253,7 +253,8 @@ class Rod:
         """Run K intervals of length dt in one compiled loop, each in `substeps` equal steps.
 
         A step that does not converge is taken in two parts, then in four and so on: a rod that is
-        stiff or fast for its step costs time. The linearisation is that of the steps as they were cut.
+        stiff or fast for its step costs time. The linearisation is that of the steps as they were
+        cut.
 
         Args:
             state: initial state.
@@ -308,12 +309,12 @@ class Rod:
         return self._backend.energy(self._as_state(state))
 
     def internal_force(self, state: RodState | ArrayLike) -> Array:
-        """Return the elastic force −∇E (4N-1,) [N, N·m]."""
-        return -self._backend.gradient_and_hessian(self._as_state(state))[0]
+        """Return the elastic force −∇E and that of Kelvin-Voigt damping (4N-1,) [N, N·m]."""
+        return self._backend.internal_force(self._as_state(state))
 
     def stiffness(self, state: RodState | ArrayLike) -> Array:
         """Return the elastic Hessian ∇²E (4N-1, 4N-1) [N/m …]."""
-        return self._backend.gradient_and_hessian(self._as_state(state))[1]
+        return self._backend.stiffness(self._as_state(state))
 
     def input_matrix(self, state: RodState | ArrayLike) -> Array:
         """Return B(q)Λ (4N-1, M) [N/Pa]: unit couples times Λ; rows of φ are zero."""
