@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,6 +18,8 @@ from der_planner.arrays import Array
 from der_planner.rod import banded_kernel, step_kernel
 from der_planner.rod.mesh import Mesh
 from der_planner.rod.step_kernel import Base, Body, Place, Record, Solver
+
+_NO_FRAMES = Base(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
 
 
 @dataclass(frozen=True)
@@ -133,17 +135,17 @@ class Backend(ABC):
     def work_space(self, base: Base) -> Any:
         """Return new work arrays for kernels that start from these frames."""
 
-    @abstractmethod
-    def frames(self, state: RodState) -> Base:
+    def frames(self, state: RodState) -> Base:  # noqa: ARG002 - a plane has none
         """Return copies of the reference frames of a state, with the ghost edge's."""
+        return _NO_FRAMES
 
-    @abstractmethod
-    def public_state(self, q: Array, v: Array, base: Base, like: RodState) -> RodState:
+    def public_state(self, q: Array, v: Array, base: Base, like: RodState) -> RodState:  # noqa: ARG002
         """Return the state at q, v with frames of the kernels, or as in `like` in a plane."""
+        return replace(like, q=q, v=v)
 
     def carry_frames(self, base: RodState, q: Array, v: Array) -> RodState:
         """Return a state at q whose frames are those of `base`, transported where they turn."""
-        return RodState(q, v, base.directors, base.reference_twist)
+        return replace(base, q=q, v=v)
 
     @abstractmethod
     def framed(self, state: RodState) -> tuple[Array, Any, Array]:
@@ -253,7 +255,6 @@ class Backend(ABC):
     ) -> tuple[RodState, int, float]:
         """Solve the balance of forces from `start`; iterations are negative without convergence."""
         x, base = self.unknowns(start.q), self.frames(start)
-        solver = solver._replace(lever=self.lever)
         iterations, update = self.kernels.newton(
             x, x.copy(), np.zeros(self.size), 0.0, u, solver, self.work_space(base),
             self.loaded(load),
@@ -313,9 +314,7 @@ class Backend(ABC):
 def general_band_to_dense(band: Array) -> Array:
     """Return the full matrix of a general band stored by rows."""
     size, width = band.shape
-    half = (width - 1) // 2
-    result = np.zeros((size, size))
-    for row in range(size):
-        first, last = max(0, row - half), min(size, row + half + 1)
-        result[row, first:last] = band[row, first - row + half : last - row + half]
-    return result
+    wide = np.zeros((size, size + width - 1))
+    rows = np.arange(size)[:, None]
+    wide[rows, rows + np.arange(width)] = band
+    return wide[:, width // 2 : width // 2 + size]

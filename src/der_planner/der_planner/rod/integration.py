@@ -248,7 +248,7 @@ def find_equilibrium(backend: Backend, start: RodState, u: Array, load: Array) -
     length = float(edges.sum())
     # An iteration moves nodes by at most twice the shortest edge.
     limit = _STATIC_LIMIT + round(0.5 * length * float(1.0 / edges.min() - 1.0 / edges.mean()))
-    solver = Solver(h=1.0, extrapolate=np.ones(1), tolerance=1e-11 * length, lever=0.0, limit=limit)
+    solver = Solver(1.0, np.ones(1), 1e-11 * length, backend.lever, limit)
     state, iterations, update = backend.solve_static(start, u, load, solver)
     if iterations > 0:
         return state
