@@ -130,7 +130,7 @@ def test_pressures_in_small_steps_do_not_shake_the_friction_loose():
         share = step // 2 * 2 / 400  # a board that tells its pressures every 20 ms
         level = 14_000.0 * np.sin(0.5 * np.pi * share) ** 2
         twin.step(REST + np.array([level, 0.0, 0.0, 0.0]), 0.01)
-    first = twin._vertex_segment == 0
+    first = twin._body.vertex_segment == 0
     assert twin._material.friction[first].min() > 0.8
     assert twin._material.friction[first].mean() > 0.9
 

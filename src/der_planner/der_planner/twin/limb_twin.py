@@ -89,13 +89,11 @@ class LimbTwin:
         self._ramp_left = 0
         self._wander_noise = np.random.default_rng([7_919, seed, run])
         self._pegs = Pegs(np.empty((0, 3)), np.empty(0), np.empty((0, 3, 1)))
-        body = build(self._hardware)
-        rod = self._rod = body.rod
-        self._arrays, self._material = body.arrays, body.material
-        self._node_arc = body.node_arc
-        self._element_segment, self._vertex_segment = body.element_segment, body.vertex_segment
-        self._rigid_elements = np.nonzero(self._element_segment < 0)[0]
-        self._loads = NodeLoads(self._node_arc, rod.mass, rod.external_forces, gravity)
+        self._body = build(self._hardware)
+        rod = self._rod = self._body.rod
+        self._material = self._body.material
+        self._rigid_elements = np.nonzero(self._body.element_segment < 0)[0]
+        self._loads = NodeLoads(self._body.node_arc, rod.mass, rod.external_forces, gravity)
         for item in masses:
             self.push(Push(-math.inf, item.arc_length, mass=item.mass))
         self._wander = np.array([s.wander for s in self._hardware.segments])
@@ -145,7 +143,7 @@ class LimbTwin:
             left = (self._loads.next_change(self.time) - self.time) / TIME_STEP
             count = math.ceil(min(steps, left))
             drag = self._hardware.drag
-            advance(self._arrays, self._material, ramp, self._pegs, count, TIME_STEP, drag)
+            advance(self._body.arrays, self._material, ramp, self._pegs, count, TIME_STEP, drag)
             ramp = ramp._replace(steps=max(0, ramp.steps - count))
             steps -= count
             self.time += count * TIME_STEP
@@ -192,7 +190,7 @@ class LimbTwin:
         Returns:
             Interpolated between nodes by cubic Hermite pieces along the material tangents.
         """
-        node_arc = self._node_arc
+        node_arc = self._body.node_arc
         arc = (
             np.sort(np.concatenate([node_arc, 0.5 * (node_arc[1:] + node_arc[:-1])]))
             if points == 0
@@ -240,7 +238,7 @@ class LimbTwin:
                 self._wander_noise.standard_normal()
             )
             left, right = gauge[2 * index], gauge[2 * index + 1]
-            here = self._vertex_segment == index
+            here = self._body.vertex_segment == index
             target["active"][here] = self.gain * (
                 segment.chamber_gain[0] * left
                 - segment.chamber_gain[1] * right
@@ -250,7 +248,7 @@ class LimbTwin:
                 1.0 + segment.pressure_stiffening * (left + right)
             )
             target["rest"][here] = segment.rest_curvature + self._wander[index]
-            target["rest_stretch"][self._element_segment == index] = segment.elongation * (
+            target["rest_stretch"][self._body.element_segment == index] = segment.elongation * (
                 left + right
             )
         return target
@@ -265,7 +263,9 @@ class LimbTwin:
     def _settle(self) -> None:
         steps = int(2.0 / TIME_STEP)
         ramp = self._ramp(self._target(self._pressure, 0.0), steps // 4)
-        advance(self._arrays, self._material, ramp, self._pegs, steps, TIME_STEP, _SETTLING_DRAG)
+        advance(
+            self._body.arrays, self._material, ramp, self._pegs, steps, TIME_STEP, _SETTLING_DRAG
+        )
         self._stop()
 
     def _settle_under_loads(self) -> None:
@@ -282,7 +282,7 @@ class LimbTwin:
         ramp = self._ramp(self._target(self._pressure, 0.0), 0)
         steps = round(0.5 / TIME_STEP)
         for _ in range(round(_LONGEST_SETTLING / (steps * TIME_STEP))):
-            advance(self._arrays, calm, ramp, self._pegs, steps, TIME_STEP, _SETTLING_DRAG)
+            advance(self._body.arrays, calm, ramp, self._pegs, steps, TIME_STEP, _SETTLING_DRAG)
             if np.abs(self._rod.velocity_collection).max() < _SETTLED_SPEED:
                 break
         self._stop()
@@ -302,7 +302,7 @@ class LimbTwin:
     def _node_headings(self) -> Array:
         element = self._element_headings()
         # Between a stiff and a flexible element the bend belongs to the flexible half.
-        flexible = np.where(self._element_segment >= 0, self._rod.rest_lengths, 0.0)
+        flexible = np.where(self._body.element_segment >= 0, self._rod.rest_lengths, 0.0)
         weight = flexible[1:] / np.maximum(flexible[1:] + flexible[:-1], 1e-12)
         inner = element[:-1] + (1.0 - weight) * np.diff(element)
         return np.concatenate([element[:1], inner, element[-1:]])
