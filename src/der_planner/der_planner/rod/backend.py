@@ -97,7 +97,7 @@ class Backend(ABC):
     """What integration, linearisation and statics need of a rod; planar or spatial.
 
     Attributes:
-        mesh: the numbers of the rod.
+        mesh: the numbers of the rod. length: of all its edges [m].
         index: indices into q of the coordinates that the kernels have.
         offset: unknowns of the ghost node, before those of q.
         size: n, unknowns of the kernels.
@@ -117,7 +117,7 @@ class Backend(ABC):
     rod: Any
 
     def __init__(self, mesh: Mesh, index: NDArray[np.int64]) -> None:
-        self.mesh = mesh
+        self.mesh, self.length = mesh, float(mesh.rest.sum())
         self.index = index
         self.offset = self.unknowns_per_node * int(mesh.ghost)
         self.size = len(index) + self.offset

@@ -65,7 +65,7 @@ class SpatialBackend(Backend):
     def __init__(self, mesh: Mesh) -> None:
         super().__init__(mesh, np.arange(4 * mesh.nodes - 1))
         self.turning_edges = mesh.nodes - 1 + int(mesh.ghost)
-        self.lever = 0.1 * float(mesh.rest.sum())
+        self.lever = 0.1 * self.length
         self.rod = SpatialRod(
             **self.numbers(),
             twist=self.ghosted(mesh.twist),

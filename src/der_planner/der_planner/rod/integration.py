@@ -168,8 +168,7 @@ def integrate(
     """
     require(method in _STAGES, "method", f"one of {sorted(_STAGES)}", method)
     fraction, extrapolate = _STAGES[method]
-    tolerance = 1e-10 * float(backend.mesh.rest.sum())
-    solver = Solver(dt * fraction, extrapolate, tolerance, backend.lever, limit=_LIMIT)
+    solver = Solver(dt * fraction, extrapolate, 1e-10 * backend.length, backend.lever, _LIMIT)
     intervals, steps, _ = pressures.shape
     linearise, place = outputs is not None, backend.place(state)
     x, rate = np.empty((2, intervals + 1, backend.size))
@@ -177,9 +176,10 @@ def integrate(
     spent, begin, pieces = 0, 0, []
     while begin < intervals * steps:
         piece = backend.simulate(place, (x, rate), pressures, begin, solver, load, linearise)
-        pieces.append(_recorded(piece, solver, np.arange(begin, piece.done)))
-        spent, begin = spent + piece.iterations, piece.done
-        before, parts = backend.state(place, state), 1
+        if linearise:
+            pieces.append(_recorded(piece, solver, np.arange(begin, piece.done)))
+        spent, begin, parts = spent + piece.iterations, piece.done, 1
+        before = backend.state(place, state) if piece.failed_iterations else state
         while piece.failed_iterations:
             if parts == 2**halvings:
                 cut = f", also in {parts} parts" if parts > 1 else ""
@@ -197,7 +197,8 @@ def integrate(
             piece = backend.simulate(place, motion, inputs, 0, short, load, linearise)
             spent += piece.iterations
         if parts > 1:
-            pieces.append(_recorded(piece, short, np.full(parts, begin)))
+            if linearise:
+                pieces.append(_recorded(piece, short, np.full(parts, begin)))
             begin += 1
             if begin % steps == 0:
                 x[begin // steps], rate[begin // steps] = place.x, place.v
@@ -244,8 +245,7 @@ def find_equilibrium(backend: Backend, start: RodState, u: Array, load: Array) -
     Raises:
         ConvergenceError: the parts became too small.
     """
-    edges = backend.mesh.rest
-    length = float(edges.sum())
+    edges, length = backend.mesh.rest, backend.length
     # An iteration moves nodes by at most twice the shortest edge.
     limit = _STATIC_LIMIT + round(0.5 * length * float(1.0 / edges.min() - 1.0 / edges.mean()))
     solver = Solver(1.0, np.ones(1), 1e-11 * length, backend.lever, limit)
