@@ -174,13 +174,10 @@ def balance(angle: Array, law: RestingLaw, instant: Instant) -> None:
     balance of all is convex below the load that buckles the limb, so that this converges.
     """
     count = angle.shape[0]
-    torque, slope = np.empty(count), np.zeros((count, count))
+    torque, slope = np.empty(count), np.empty((count, count))
     heavy = law.weight.lever.shape[0] > 0
-    if not heavy:
-        torque[:] = 0.0
     for _ in range(_ROUNDS):
-        if heavy:
-            weigh(angle, law, torque, slope)
+        weigh(angle, law, torque, slope)
         moved, before = 0.0, angle.copy()
         for i in range(count):
             pulled = torque[i]
