@@ -301,23 +301,3 @@ def simulate(
                 A[k, s], B[k, s] = dx[:, : 2 * n], dx[:, 2 * n :]
         angles[k + 1], rates[k + 1] = q, v
     return angles, rates, A, B
-
-
-@njit(cache=True, nogil=True)
-def sensitivity(A: Vector, B: Vector, pulse: Vector) -> Vector:
-    """Return ∂angle/∂input (K + 1, n, K, n) for inputs that raise the R steps after their instant.
-
-    pulse (R, n) is the pressure in these steps when an input is raised by one.
-    """
-    count, substeps, _, n = B.shape
-    result = np.zeros((count + 1, n, count, n))
-    for k in range(count):
-        x = np.zeros((2 * n, n))
-        for m in range(k, count):
-            for s in range(substeps):
-                r = (m - k) * substeps + s
-                x = A[m, s] @ x
-                if r < pulse.shape[0]:
-                    x += B[m, s] * pulse[r]
-            result[m + 1, :, k, :] = x[:n]
-    return result

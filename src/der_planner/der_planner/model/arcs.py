@@ -66,11 +66,14 @@ class ArcFirstOrder:
 
     def sensitivity(self, pulse: Array | None = None) -> Array:
         """Return ∂tip/∂input, see `FirstOrder.sensitivity`."""
-        steps, n = self.by_pressure.shape[1], self.by_pressure.shape[3]
+        count, steps, _, n = self.by_pressure.shape
         shape = np.ones((steps, n)) if pulse is None else pulse
-        angles = kernels.sensitivity(self.by_state, self.by_pressure, shape)
-        moved: Array = np.einsum("kan,knjm->kajm", self.tip_by_angle, angles)
-        return moved
+        inputs, own = np.zeros((count * steps, n, count, n)), np.arange(n)
+        for k in range(count):
+            raised = inputs[k * steps :][: len(shape)]
+            raised[:, own, k, own] = shape[: len(raised)]
+        moved = self.tangent(inputs.reshape(count, steps, n, -1))[0]
+        return moved.reshape(count + 1, 2, count, n)
 
 
 class ArcModel(Model):
