@@ -41,6 +41,7 @@ from der_planner.planning.loads import (
     PlanningError,
     check_load,
     check_stays,
+    held_poses,
     stable_rest,
 )
 from der_planner.planning.motions import Reference
@@ -52,7 +53,7 @@ from der_planner.planning.workspace import (
     UnreachableError,
     Workspace,
 )
-from der_planner.rod import ConvergenceError, RodState
+from der_planner.rod import RodState
 
 METHODS = {"der": ("paper", "projected", "optimal"), "pcc": ("paper", "projected", "optimal")}
 """The methods of each model. Arcs have one unknown a pressure: their two balances are the same."""
@@ -374,15 +375,8 @@ def _find_poses(model: RodModel, time: Array, tip: Array, guess: Array) -> Poses
         BucklingError: the rod would buckle or snap through on the way.
         UnreachableError: a pose misses its point.
     """
-    try:
-        poses = PoseFinder(model, REFERENCE_PRIOR).along(stable_rest(model), tip, guess)
-    except ConvergenceError as error:
-        raise BucklingError(
-            f"no pose of the limb leads on to its tip at ({tip[error.step, 0]:.4f}, "
-            f"{tip[error.step, 1]:.4f}) m at t = {time[error.step]:.2f} s: it would buckle or snap "
-            "through under its load. Shrink or move the motion, or mount the limb otherwise",
-            tip[error.step],
-        ) from error
+    finder = PoseFinder(model, REFERENCE_PRIOR)
+    poses = held_poses(finder, stable_rest(model), time, tip, guess)
     check_stays(poses.smallest_stiffness, time, tip, "limb")
     missed = poses.misses > _POSE_TOLERANCE * model.limb.length
     if missed.any() and model.inputs > 1:
