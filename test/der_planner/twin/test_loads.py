@@ -135,12 +135,12 @@ def test_a_peg_holds_the_limb_with_the_force_that_would_hold_it_there():
     normal = np.array([-math.sin(shape.heading[place]), math.cos(shape.heading[place])])
     held.put_pegs([*(shape.points[place] + (RADIUS + radius - 0.008) * normal), radius])
     held.step(pressure, 3.0)
-    clearance = np.linalg.norm(held.shape(400).points - held._pegs.centre[0, :2], axis=1).min()
+    clearance = np.linalg.norm(held.shape().points - held._pegs.centre[0, :2], axis=1).min()
     assert clearance == pytest.approx(RADIUS + radius, abs=2e-4)
     force = -held._pegs.force.sum(axis=0)[:, 0]
     assert force[:2] @ normal < -0.1
     # What presses at that place instead of the peg leads to the same shape.
-    near = held.shape(400)
+    near = held.shape()
     touched = np.argmin(np.linalg.norm(near.points - held._pegs.centre[0, :2], axis=1))
     pushed.push(Push(0.0, near.arc_length[touched], (*force[:2], 0.0)))
     pushed.step(pressure, 3.0)

@@ -171,7 +171,7 @@ class LimbTwin:
         """
         x, y, radius = np.asarray(pegs, dtype=float).reshape(-1, 3).T
         centre = np.stack([x, y, np.zeros_like(x)], axis=1)
-        points = self.shape(200).points
+        points = self.shape().points
         for peg, size in zip(centre[:, :2], radius, strict=True):
             if np.linalg.norm(points - peg, axis=1).min() < RADIUS + size:
                 raise TwinError(
@@ -180,38 +180,22 @@ class LimbTwin:
                 )
         self._pegs = Pegs(centre, np.ascontiguousarray(radius), np.zeros((len(centre), 3, 1)))
 
-    def shape(self, points: int = 0) -> TwinShape:
-        """Return the true centreline.
+    def shape(self) -> TwinShape:
+        """Return the true centreline at the nodes and in the middle of each element.
 
-        Args:
-            points: number of equally spaced points; 0 gives the nodes and the middle of each
-                element.
-
-        Returns:
-            Interpolated between nodes by cubic Hermite pieces along the material tangents.
+        The middles are those of cubic Hermite pieces along the material tangents.
         """
-        node_arc = self._body.node_arc
-        arc = (
-            np.sort(np.concatenate([node_arc, 0.5 * (node_arc[1:] + node_arc[:-1])]))
-            if points == 0
-            else np.linspace(0.0, node_arc[-1], points)
-        )
-        heading = self._node_headings()
+        arc, heading = self._body.node_arc, self._node_headings()
         nodes = self._rod.position_collection[:2].T
-        stretch = np.linalg.norm(np.diff(nodes, axis=0), axis=1) / np.diff(node_arc)
-        index = np.clip(np.searchsorted(node_arc, arc, side="right") - 1, 0, len(node_arc) - 2)
-        step = (node_arc[1:] - node_arc[:-1])[index]
-        u = (arc - node_arc[index]) / step
         tangent = np.stack([np.cos(heading), np.sin(heading)], axis=1)
-        scale = (step * stretch[index])[:, None]
-        u = u[:, None]
-        curve = (
-            (1 + 2 * u) * (1 - u) ** 2 * nodes[index]
-            + u * (1 - u) ** 2 * scale * tangent[index]
-            + u**2 * (3 - 2 * u) * nodes[index + 1]
-            + u**2 * (u - 1) * scale * tangent[index + 1]
+        lengths = np.linalg.norm(np.diff(nodes, axis=0), axis=1)[:, None]
+        middle = 0.5 * (nodes[1:] + nodes[:-1]) - lengths / 8 * np.diff(tangent, axis=0)
+        between = np.arange(1, len(nodes))
+        return TwinShape(
+            np.insert(arc, between, 0.5 * (arc[1:] + arc[:-1])),
+            np.insert(nodes, between, middle, axis=0),
+            np.insert(heading, between, 0.5 * (heading[1:] + heading[:-1])),
         )
-        return TwinShape(arc, curve, np.interp(arc, node_arc, heading))
 
     def _target(self, chamber_pressure: Array, duration: float) -> dict[str, Array]:
         """Return what the material shall be under these pressures, by the fields of `Ramp`."""
