@@ -134,15 +134,12 @@ class ArcModel(Model):
 
     def _place(self, arc_length: float) -> tuple[int, float, float]:
         """Return segment, fraction of it and distance past its end [m] of a place on the limb."""
-        left = arc_length - self.base
-        for j, length in enumerate(self.lengths):
-            last = j == self.segment_count - 1
-            if left <= length or last:
-                return j, min(left / length, 1.0), 0.0
-            if left <= length + self.connector:
-                return j, 1.0, left - length
-            left -= length + self.connector
-        raise AssertionError("the last segment takes what is left")
+        left, spans = arc_length - self.base, self.lengths + self.connector
+        last = self.segment_count - 1
+        j = min(int(np.searchsorted(np.cumsum(spans), left)), last)
+        inside = left - spans[:j].sum()
+        past = 0.0 if j == last else max(inside - self.lengths[j], 0.0)
+        return j, min(inside / self.lengths[j], 1.0), past
 
     def _check(self, name: str, value: ArrayLike) -> Array:
         array = np.asarray(value, dtype=float)
@@ -177,18 +174,12 @@ class ArcModel(Model):
     def curve(self, bend_angles: ArrayLike, points_per_segment: int = 12) -> Array:
         """Return points (P, 2) [m] of the centreline from clamp to tip for one configuration."""
         q = self._check("bend_angles", bend_angles)
-        position, heading = complex(self.base), 1 + 0j
-        points = [0j, position] if self.base else [0j]
-        for j, angle in enumerate(q):
-            if j:
-                position += heading * self.connector
-                points.append(position)
-            fractions = np.arange(1, points_per_segment + 1) / points_per_segment
-            arcs = fractions * _arc_ends(fractions * angle)[0]
-            points += list(position + heading * self.lengths[j] * arcs)
-            position = points[-1]
-            heading *= np.exp(1j * angle)
-        line = np.array(points)
+        _, ends, headings = self._joints(q)
+        fractions = np.arange(points_per_segment + 1) / points_per_segment
+        arcs = fractions * _arc_ends(q[:, None] * fractions)[0]
+        arcs *= (headings * self.lengths)[:, None]
+        points = (ends[:, None] + arcs - arcs[:, -1:]).ravel()
+        line = np.append(0.0, points) if self.base else points
         return np.column_stack([line.real, line.imag])
 
     def elastic_torque(self, bend_angles: ArrayLike) -> Array:
