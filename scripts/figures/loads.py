@@ -44,7 +44,7 @@ def true_shape(seed: int, limb: Limb, pressure: Array) -> Array:
     # Filled over 2 s, as a board would: a jump makes the limb swing past its friction.
     for share in np.minimum(np.arange(0.05, HOLD, 0.05) / 2.0, 1.0):
         twin.step(ATMOSPHERE + share * pair_of(pressure).ravel(), 0.05)
-    return twin.shape(101).points
+    return twin.shape().points
 
 
 def model_shape(limb: Limb, model: str, pressure: Array) -> Array:

@@ -59,22 +59,6 @@ def model():
     return RodModel(UNEVEN)
 
 
-def curvatures(rod, nodes):
-    """κ = 2 tan(θ/2) at nodes 0 … N-2 of a chain (N, 2), perhaps complex, behind a ghost edge."""
-    edges = np.concatenate([[[rod.rest_lengths[0], 0.0]], np.diff(nodes, axis=0)])
-    lengths = np.sqrt((edges**2).sum(axis=1))
-    (x, y), (u, v) = edges[:-1].T, edges[1:].T
-    return 2 * (x * v - y * u) / (lengths[:-1] * lengths[1:] + x * u + y * v)
-
-
-def viscous_force(rod, nodes, velocity):
-    """−Σ (EI τ / l) κ̇ ∂κ/∂x (N, 2) of bending, with κ's derivative by complex steps."""
-    step = 1e-30j * np.eye(nodes.size).reshape(nodes.size, *nodes.shape)
-    slope = np.stack([curvatures(rod, nodes + each).imag / 1e-30 for each in step], axis=1)
-    moment = rod.mesh.viscous[:-1] * (slope @ velocity.ravel())
-    return -(slope.T @ moment).reshape(nodes.shape)
-
-
 def full_force(model, k, q, v, a):
     """M q̈ + D q̇ − F_int − F_ext of the rod itself, in its full layout."""
     rod = model.rod
@@ -86,9 +70,6 @@ def full_force(model, k, q, v, a):
         )
     state = rod.state(x, xd)
     supplied = rod.internal_force(state) + rod.external_force - rod.damping_diagonal * xd
-    viscous = viscous_force(rod, position, velocity)
-    supplied[0::4] += viscous[:, 0]
-    supplied[1::4] += viscous[:, 1]
     return state, (rod.mass_diagonal * xdd - supplied)[rod.free]
 
 

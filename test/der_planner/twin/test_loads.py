@@ -83,7 +83,7 @@ def test_a_mass_keeps_its_weight_and_its_place():
     payload, at = 0.03, 0.2
     twin = LimbTwin(hardware=hardware, masses=(PointMass(at, payload),))
     bare = LimbTwin(hardware=hardware)
-    mass, own, arc = twin._rod.mass, bare._rod.mass, twin._node_arc
+    mass, own, arc = twin._rod.mass, bare._rod.mass, twin._body.node_arc
     assert mass.sum() - own.sum() == pytest.approx(payload)
     assert (mass - own) @ arc == pytest.approx(payload * at)
     total = hardware.mass_per_length * 0.244 + hardware.connector_mass + hardware.tip_mass
@@ -129,18 +129,18 @@ def test_a_peg_holds_the_limb_with_the_force_that_would_hold_it_there():
     free, held, pushed = (LimbTwin(hardware=elastic(drag=8.0)) for _ in range(3))
     free.step(pressure, 3.0)
     # Amid an element: contact is shared between its nodes by halves, wherever it is.
-    arc = free._node_arc[13:15].mean()
+    arc = free._body.node_arc[13:15].mean()
     place = int(np.argmin(np.abs(free.shape().arc_length - arc)))
     shape, radius = free.shape(), 0.01
     normal = np.array([-math.sin(shape.heading[place]), math.cos(shape.heading[place])])
     held.put_pegs([*(shape.points[place] + (RADIUS + radius - 0.008) * normal), radius])
     held.step(pressure, 3.0)
-    clearance = np.linalg.norm(held.shape(400).points - held._pegs.centre[0, :2], axis=1).min()
+    clearance = np.linalg.norm(held.shape().points - held._pegs.centre[0, :2], axis=1).min()
     assert clearance == pytest.approx(RADIUS + radius, abs=2e-4)
     force = -held._pegs.force.sum(axis=0)[:, 0]
     assert force[:2] @ normal < -0.1
     # What presses at that place instead of the peg leads to the same shape.
-    near = held.shape(400)
+    near = held.shape()
     touched = np.argmin(np.linalg.norm(near.points - held._pegs.centre[0, :2], axis=1))
     pushed.push(Push(0.0, near.arc_length[touched], (*force[:2], 0.0)))
     pushed.step(pressure, 3.0)

@@ -130,17 +130,8 @@ def parameter(
         fit: the unknown of the fit, if any.
     """
     low, high = map(float, interval[1:-1].split(","))
-    declared = Parameter(
-        unit=unit,
-        text=text,
-        choose=choose,
-        low=low,
-        high=high,
-        low_allowed=not interval.startswith("(") or low == -math.inf,
-        high_allowed=not interval.endswith(")") or high == math.inf,
-        needs=needs,
-        fit=fit,
-    )
+    ends = interval.startswith("["), interval.endswith("]")
+    declared = Parameter(unit, text, choose, low, high, *ends, needs=needs, fit=fit)
     return field(default=default, metadata={_KEY: declared})
 
 

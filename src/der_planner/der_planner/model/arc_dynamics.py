@@ -10,8 +10,8 @@ A straight limb is an ordinary configuration, see `arc_kernel`.
 Symbols: q (n,) bend angles [rad], P position of a particle as a function of q, J_i = ∂P/∂q_i,
 H_ik = ∂²P/∂q_i∂q_k. With the particles' masses m, M_ij = Σ m ⟨J_i, J_j⟩, C_ij = Σ m ⟨J_i, Σ_k H_jk
 q̇_k⟩ and gravity's torque is Σ m ⟨J_i, g⟩. Since H is symmetric these are Christoffel's symbols, and
-Ṁ = C + Cᵀ holds exactly, term by term. The particles are the quadrature points of the distributed
-mass and what the limb carries.
+Ṁ = C + Cᵀ holds exactly, term by term: C is needed, and formed, only as C q̇. The particles are the
+quadrature points of the distributed mass and what the limb carries.
 """
 
 from __future__ import annotations
@@ -108,42 +108,9 @@ def arc_slopes(q: Vector, arcs: Arcs, frame: Complex, order: int) -> Complex:
     return result
 
 
-@njit(cache=True, nogil=True)
-def inertia(q: Vector, v: Vector, arcs: Arcs) -> tuple[Vector, Vector, Vector, Vector]:
-    """Return M (n, n), C (n, n), the mass-proportional damping D (n, n) and gravity's torque (n,).
-
-    q, v are bend angles [rad] and their rates [rad/s], (n,) each.
-    """
-    n = q.size
-    M, C, D = np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n))
-    torque = np.zeros(n)
-    J = np.zeros(n, dtype=np.complex128)
-    H = np.zeros((n, n), dtype=np.complex128)
-    rate = np.zeros(n, dtype=np.complex128)
-    frame = joints(q, arcs)
-    slopes = arc_slopes(q, arcs, frame, 2)
-    for p in range(arcs.owner.size):
-        mass, drag, last = arcs.mass[p], arcs.drag[p], arcs.owner[p] + 1
-        point_derivatives(q, arcs, frame, p, slopes, J, H)
-        for i in range(last):
-            total = 0.0 + 0.0j
-            for k in range(last):
-                total += H[i, k] * v[k]
-            rate[i] = total
-        for i in range(last):
-            pulled = J[i].real * arcs.gravity[0] + J[i].imag * arcs.gravity[1]
-            torque[i] += arcs.weight[p] * pulled
-            for k in range(last):
-                product = J[i].real * J[k].real + J[i].imag * J[k].imag
-                M[i, k] += mass * product
-                D[i, k] += drag * product
-                C[i, k] += mass * (J[i].real * rate[k].real + J[i].imag * rate[k].imag)
-    return M, C, D, torque
-
-
 @njit(cache=True, nogil=True, inline="always")
-def acceleration(q: Vector, v: Vector, torque: Vector, arcs: Arcs) -> Vector:
-    """Return q̈ from M q̈ + C q̇ + D q̇ + K(q) = torque + gravity's torque, all (n,).
+def inertia_and_force(q: Vector, v: Vector, torque: Vector, arcs: Arcs) -> tuple[Vector, Vector]:
+    """Return M (n, n), its lower half, and torque + gravity's torque − (C + D) q̇ − K(q) (n,).
 
     The forces are summed particle by particle: m (g − Σ_kl H_kl q̇_k q̇_l) less the drag on its
     velocity, by the particle's J. C and D, of which only the products with q̇ count, are not formed.
@@ -173,44 +140,29 @@ def acceleration(q: Vector, v: Vector, torque: Vector, arcs: Arcs) -> Vector:
             force[i] += J[i].real * felt.real + J[i].imag * felt.imag
             for k in range(i + 1):
                 M[i, k] += mass * (J[i].real * J[k].real + J[i].imag * J[k].imag)
+    return M, force
+
+
+@njit(cache=True, nogil=True, inline="always")
+def acceleration(q: Vector, v: Vector, torque: Vector, arcs: Arcs) -> Any:
+    """Return q̈ (n,) from M q̈ + C q̇ + D q̇ + K(q) = torque + gravity's torque."""
+    M, force = inertia_and_force(q, v, torque, arcs)
     factorise(M)
     substitute(M, force)
     return force
 
 
 @njit(cache=True, nogil=True)
-def simulate(
-    q: Vector, v: Vector, pressures: Vector, step: float, parts: int, arcs: Arcs
-) -> tuple[Vector, Vector]:
-    """Roll the model forward with the classical Runge-Kutta method.
-
-    pressures (K, S, n) [Pa] are constant over each of the S steps of an interval; each step [s] is
-    taken in so many parts. Returns angles and rates (K + 1, n) at the interval boundaries.
-    """
-    count, substeps, n = pressures.shape
-    angles = np.zeros((count + 1, n))
-    rates = np.zeros((count + 1, n))
-    angles[0] = q
-    rates[0] = v
-    slopes = np.zeros((4, n))
-    h = step / parts
-    for k in range(count):
-        for s in range(substeps * parts):
-            torque = arcs.gain * pressures[k, s // parts]
-            q_stage, v_stage = q, v
-            q_total, v_total = np.zeros(n), np.zeros(n)
-            for stage in range(4):
-                slopes[stage] = acceleration(q_stage, v_stage, torque, arcs)
-                share = 2.0 if stage in (1, 2) else 1.0
-                q_total += share * v_stage
-                v_total += share * slopes[stage]
-                ahead = h if stage == 2 else 0.5 * h
-                q_stage, v_stage = q + ahead * v_stage, v + ahead * slopes[stage]
-            q = q + h / 6.0 * q_total
-            v = v + h / 6.0 * v_total
-        angles[k + 1] = q
-        rates[k + 1] = v
-    return angles, rates
+def needed_torque(q: Vector, v: Vector, a: Vector, arcs: Arcs) -> Vector:
+    """Return M q̈ + C q̇ + D q̇ + K(q) − gravity's torque (K, n) at angles, rates, accelerations."""
+    result = np.empty_like(q)
+    for k in range(len(q)):
+        M, force = inertia_and_force(q[k], v[k], np.zeros(q.shape[1]), arcs)
+        for i in range(q.shape[1]):
+            result[k, i] = -force[i]
+            for j in range(q.shape[1]):
+                result[k, i] += M[max(i, j), min(i, j)] * a[k, j]
+    return result
 
 
 # The linearisation ------------------------------------------------------------------------------
@@ -292,18 +244,22 @@ def force_slopes(q: Vector, v: Vector, a: Vector, arcs: Arcs) -> tuple[Vector, V
 
 
 @njit(cache=True, nogil=True)
-def linearised(
-    q: Vector, v: Vector, pressures: Vector, step: float, parts: int, arcs: Arcs
+def simulate(
+    q: Vector, v: Vector, pressures: Vector, step: float, parts: int, arcs: Arcs, linearise: bool
 ) -> tuple[Vector, Vector, Vector, Vector]:
-    """Roll the model forward as `simulate`, and linearise each of its steps.
+    """Roll the model forward with the classical Runge-Kutta method.
 
-    Returns also A (K, S, 2n, 2n) and B (K, S, 2n, n): x′ = A x + B u for changes of x = (q, v) and
-    of the step's pressures u.
+    pressures (K, S, n) [Pa] are constant over each of the S steps of an interval; each step [s] is
+    taken in so many parts. Returns angles and rates (K + 1, n) at the interval boundaries.
+
+    To linearise each step, also A (K, S, 2n, 2n) and B (K, S, 2n, n): x′ = A x + B u for changes of
+    x = (q, v) and of the step's pressures u; else these are empty.
     """
     count, substeps, n = pressures.shape
     angles, rates = np.zeros((count + 1, n)), np.zeros((count + 1, n))
-    A = np.zeros((count, substeps, 2 * n, 2 * n))
-    B = np.zeros((count, substeps, 2 * n, n))
+    kept, columns = (count, 3 * n) if linearise else (0, 0)
+    A = np.zeros((kept, substeps, 2 * n, 2 * n))
+    B = np.zeros((kept, substeps, 2 * n, n))
     angles[0], rates[0] = q, v
     h = step / parts
     right = np.empty(n)
@@ -311,57 +267,37 @@ def linearised(
         for s in range(substeps):
             torque = arcs.gain * pressures[k, s]
             # Columns: changes by q and v before the step, and by its pressures.
-            dx = np.zeros((2 * n, 3 * n))
-            for i in range(2 * n):
-                dx[i, i] = 1.0
+            dx = np.eye(2 * n, columns)
             for _ in range(parts):
                 q_stage, v_stage, d_stage = q, v, dx
                 q_total, v_total = np.zeros(n), np.zeros(n)
-                d_total = np.zeros((2 * n, 3 * n))
+                d_total = np.zeros((2 * n, columns))
                 for stage in range(4):
                     slope = acceleration(q_stage, v_stage, torque, arcs)
-                    by_angle, by_rate, M = force_slopes(q_stage, v_stage, slope, arcs)
-                    factorise(M)
-                    d_slope = np.empty((2 * n, 3 * n))
-                    for c in range(3 * n):
-                        for i in range(n):
-                            right[i] = arcs.gain[i] if c == 2 * n + i else 0.0
-                            for j in range(n):
-                                right[i] -= by_angle[i, j] * d_stage[j, c]
-                                right[i] -= by_rate[i, j] * d_stage[n + j, c]
-                        substitute(M, right)
-                        d_slope[:n, c] = d_stage[n:, c]
-                        d_slope[n:, c] = right
                     share = 2.0 if stage in (1, 2) else 1.0
+                    ahead = h if stage == 2 else 0.5 * h
+                    if linearise:
+                        by_angle, by_rate, M = force_slopes(q_stage, v_stage, slope, arcs)
+                        factorise(M)
+                        d_slope = np.empty((2 * n, columns))
+                        for c in range(columns):
+                            for i in range(n):
+                                right[i] = arcs.gain[i] if c == 2 * n + i else 0.0
+                                for j in range(n):
+                                    right[i] -= by_angle[i, j] * d_stage[j, c]
+                                    right[i] -= by_rate[i, j] * d_stage[n + j, c]
+                            substitute(M, right)
+                            d_slope[:n, c] = d_stage[n:, c]
+                            d_slope[n:, c] = right
+                        d_total += share * d_slope
+                        d_stage = dx + ahead * d_slope
                     q_total += share * v_stage
                     v_total += share * slope
-                    d_total += share * d_slope
-                    ahead = h if stage == 2 else 0.5 * h
                     q_stage, v_stage = q + ahead * v_stage, v + ahead * slope
-                    d_stage = dx + ahead * d_slope
                 q = q + h / 6.0 * q_total
                 v = v + h / 6.0 * v_total
                 dx = dx + h / 6.0 * d_total
-            A[k, s], B[k, s] = dx[:, : 2 * n], dx[:, 2 * n :]
+            if linearise:
+                A[k, s], B[k, s] = dx[:, : 2 * n], dx[:, 2 * n :]
         angles[k + 1], rates[k + 1] = q, v
     return angles, rates, A, B
-
-
-@njit(cache=True, nogil=True)
-def sensitivity(A: Vector, B: Vector, pulse: Vector) -> Vector:
-    """Return ∂angle/∂input (K + 1, n, K, n) for inputs that raise the R steps after their instant.
-
-    pulse (R, n) is the pressure in these steps when an input is raised by one.
-    """
-    count, substeps, _, n = B.shape
-    result = np.zeros((count + 1, n, count, n))
-    for k in range(count):
-        x = np.zeros((2 * n, n))
-        for m in range(k, count):
-            for s in range(substeps):
-                r = (m - k) * substeps + s
-                x = A[m, s] @ x
-                if r < pulse.shape[0]:
-                    x += B[m, s] * pulse[r]
-            result[m + 1, :, k, :] = x[:n]
-    return result

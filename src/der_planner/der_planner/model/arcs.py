@@ -66,11 +66,14 @@ class ArcFirstOrder:
 
     def sensitivity(self, pulse: Array | None = None) -> Array:
         """Return ∂tip/∂input, see `FirstOrder.sensitivity`."""
-        steps, n = self.by_pressure.shape[1], self.by_pressure.shape[3]
+        count, steps, _, n = self.by_pressure.shape
         shape = np.ones((steps, n)) if pulse is None else pulse
-        angles = kernels.sensitivity(self.by_state, self.by_pressure, shape)
-        moved: Array = np.einsum("kan,knjm->kajm", self.tip_by_angle, angles)
-        return moved
+        inputs, own = np.zeros((count * steps, n, count, n)), np.arange(n)
+        for k in range(count):
+            raised = inputs[k * steps :][: len(shape)]
+            raised[:, own, k, own] = shape[: len(raised)]
+        moved = self.tangent(inputs.reshape(count, steps, n, -1))[0]
+        return moved.reshape(count + 1, 2, count, n)
 
 
 class ArcModel(Model):
@@ -131,15 +134,12 @@ class ArcModel(Model):
 
     def _place(self, arc_length: float) -> tuple[int, float, float]:
         """Return segment, fraction of it and distance past its end [m] of a place on the limb."""
-        left = arc_length - self.base
-        for j, length in enumerate(self.lengths):
-            last = j == self.segment_count - 1
-            if left <= length or last:
-                return j, min(left / length, 1.0), 0.0
-            if left <= length + self.connector:
-                return j, 1.0, left - length
-            left -= length + self.connector
-        raise AssertionError("the last segment takes what is left")
+        left, spans = arc_length - self.base, self.lengths + self.connector
+        last = self.segment_count - 1
+        j = min(int(np.searchsorted(np.cumsum(spans), left)), last)
+        inside = left - spans[:j].sum()
+        past = 0.0 if j == last else max(inside - self.lengths[j], 0.0)
+        return j, min(inside / self.lengths[j], 1.0), past
 
     def _check(self, name: str, value: ArrayLike) -> Array:
         array = np.asarray(value, dtype=float)
@@ -174,23 +174,13 @@ class ArcModel(Model):
     def curve(self, bend_angles: ArrayLike, points_per_segment: int = 12) -> Array:
         """Return points (P, 2) [m] of the centreline from clamp to tip for one configuration."""
         q = self._check("bend_angles", bend_angles)
-        position, heading = complex(self.base), 1 + 0j
-        points = [0j, position] if self.base else [0j]
-        for j, angle in enumerate(q):
-            if j:
-                position += heading * self.connector
-                points.append(position)
-            fractions = np.arange(1, points_per_segment + 1) / points_per_segment
-            arcs = fractions * _arc_ends(fractions * angle)[0]
-            points += list(position + heading * self.lengths[j] * arcs)
-            position = points[-1]
-            heading *= np.exp(1j * angle)
-        line = np.array(points)
+        _, ends, headings = self._joints(q)
+        fractions = np.arange(points_per_segment + 1) / points_per_segment
+        arcs = fractions * _arc_ends(q[:, None] * fractions)[0]
+        arcs *= (headings * self.lengths)[:, None]
+        points = (ends[:, None] + arcs - arcs[:, -1:]).ravel()
+        line = np.append(0.0, points) if self.base else points
         return np.column_stack([line.real, line.imag])
-
-    def _inertia(self, q: Array, v: Array) -> tuple[Array, Array, Array, Array]:
-        result: tuple[Array, Array, Array, Array] = kernels.inertia(q, v, self.arcs)
-        return result
 
     def elastic_torque(self, bend_angles: ArrayLike) -> Array:
         """Return the elastic torque (..., n) [N·m] that opposes bend angles (..., n) [rad]."""
@@ -214,7 +204,7 @@ class ArcModel(Model):
         if not self.arcs.gravity.any() and not self.cubic.any():
             return ArcState(q, still)
         for _ in range(_RESTING_STEPS):
-            pull = self._inertia(q, still)[3] + drive - self.elastic_torque(q)
+            _, pull = kernels.inertia_and_force(q, still, drive, self.arcs)
             values, vectors = np.linalg.eigh(self.stiffness_matrix(q))
             firm = np.maximum(np.abs(values), 1e-3 * self.stiffness.min())
             step = vectors @ ((vectors.T @ pull) / firm)
@@ -242,13 +232,10 @@ class ArcModel(Model):
             (K, n) differential pressures [Pa].
         """
         q, v, a = (
-            np.atleast_2d(np.asarray(x, dtype=float)) for x in (angles, rates, accelerations)
+            np.atleast_2d(np.ascontiguousarray(x, dtype=float))
+            for x in (angles, rates, accelerations)
         )
-        torque = self.elastic_torque(q) + self.stiffness * self.material_damping * v
-        for k in range(len(q)):
-            M, C, D, weight = self._inertia(q[k], v[k])
-            torque[k] += M @ a[k] + (C + D) @ v[k] - weight
-        pressures: Array = torque / self.gain
+        pressures: Array = kernels.needed_torque(q, v, a, self.arcs) / self.gain
         return pressures
 
     def static_pressure(self, bend_angles: ArrayLike) -> Array:
@@ -274,12 +261,11 @@ class ArcModel(Model):
         if inputs.ndim != 3 or inputs.shape[2] != self.segment_count:
             raise ValueError(f"pressures must be (K, S, {self.segment_count}), got {inputs.shape}")
         step, linear = period / inputs.shape[1], None
-        given = (start.angles, start.rates, inputs, step, self._parts(step), self.arcs)
+        angles, rates, by_state, by_pressure = kernels.simulate(
+            start.angles, start.rates, inputs, step, self._parts(step), self.arcs, bool(linearise)
+        )
         if linearise:
-            angles, rates, by_state, by_pressure = kernels.linearised(*given)
             linear = ArcFirstOrder(self.tip_jacobians(angles), by_state, by_pressure)
-        else:
-            angles, rates = kernels.simulate(*given)
         return Rollout(angles, self.tip(angles), ArcState(angles[-1], rates[-1]), linear=linear)
 
     def smallest_stiffness(self, bend_angles: ArrayLike) -> float:
@@ -296,8 +282,8 @@ class ArcModel(Model):
     def _parts(self, step: float) -> int:
         """Return in how many parts the integrator takes a step, by the fastest mode of the limb."""
         zero = np.zeros(self.segment_count)
-        M, _, D, _ = self._inertia(zero, zero)
-        drag = np.linalg.solve(M, D + np.diag(self.stiffness * self.material_damping))
+        _, damping, M = kernels.force_slopes(zero, zero, zero, self.arcs)
+        drag = np.linalg.solve(M, damping)
         stiff = np.linalg.solve(M, np.diag(self.stiffness))
         rates = np.block([[0 * M, np.eye(len(M))], [-stiff, -drag]])
         fastest = float(np.abs(np.linalg.eigvals(rates)).max())

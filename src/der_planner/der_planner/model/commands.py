@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from der_planner.arrays import Array, interpolate
 from der_planner.limb import VENT_REFERENCE
@@ -124,7 +125,7 @@ def leading_commands(air: Air, time: Array, pressure: Array) -> Array:
         slope = np.gradient(pressure, time, axis=0)
         led: Array = pressure + np.where(pressure * slope >= 0, fill, vent) * slope
         return led
-    chambers, second = least_pairs(air, time, pressure)
+    chambers, second = least_pairs(time, pressure, air.law)
     slope = np.gradient(chambers, time, axis=1)
     # Below a tenth of the reference a lag would ask for less than nothing.
     full = np.maximum(chambers / VENT_REFERENCE, 0.1)
@@ -134,20 +135,13 @@ def leading_commands(air: Air, time: Array, pressure: Array) -> Array:
     return filled
 
 
-def least_pairs(air: Air, time: Array, pressure: Array) -> tuple[Array, NDArray[np.bool_]]:
+@njit(cache=True, nogil=True)
+def least_pairs(time: Array, wanted: Array, law: AirLaw) -> Any:
     """Return the least gauge pressures (2, F, M) [Pa] of chambers whose difference is wanted.
 
-    Also which chamber the command has to fill (F, M): the second, or the first. Arguments as of
-    `leading_commands`.
+    Also which chamber the command has to fill (F, M): the second, or the first. ``time`` (F,) and
+    ``wanted`` (F, M) are as of `leading_commands`.
     """
-    pairs: tuple[Array, NDArray[np.bool_]] = _least_pairs(
-        np.ascontiguousarray(pressure), np.diff(time), air.law
-    )
-    return pairs
-
-
-@njit(cache=True, nogil=True)
-def _least_pairs(wanted: Array, steps: Array, law: AirLaw) -> tuple[Array, NDArray[np.bool_]]:
     count, inputs = wanted.shape
     chambers = np.empty((2, count, inputs))
     second = np.zeros((count, inputs), dtype=np.bool_)
@@ -155,7 +149,7 @@ def _least_pairs(wanted: Array, steps: Array, law: AirLaw) -> tuple[Array, NDArr
         left, right = max(wanted[0, m], 0.0), max(-wanted[0, m], 0.0)
         for k in range(count):
             if k > 0:
-                h = steps[k - 1]
+                h = time[k] - time[k - 1]
                 left = fallen(left, 0.0, h, law)[0]
                 right = fallen(right, 0.0, h, law)[0]
             gap = wanted[k, m] + right - left
@@ -191,7 +185,7 @@ def slow_venting(air: Air, time: Array, pressure: Array) -> SlowVenting | None:
     """
     if not air.vents_slowly:
         return None
-    chambers, _ = least_pairs(air, time, pressure)
+    chambers, _ = least_pairs(time, pressure, air.law)
     both = np.minimum(chambers[0], chambers[1])
     j = int(np.argmax(both.max(axis=0)))
     fall = -np.gradient(np.abs(pressure[:, j]), time)

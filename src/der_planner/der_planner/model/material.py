@@ -287,14 +287,8 @@ class Material:
 
 def _coupling_matrix(limb: Limb) -> Array:
     """Return c (M, M): moment on segment i by pressure j, over that of its own [-]."""
-    count = limb.segment_count
-    matrix = np.zeros((count, count))
-    for index, segment in enumerate(limb.segments):
-        if index > 0:
-            matrix[index, index - 1] = segment.coupling_before
-        if index < count - 1:
-            matrix[index, index + 1] = segment.coupling_after
-    return matrix
+    before = np.diag([segment.coupling_before for segment in limb.segments[1:]], -1)
+    return before + np.diag([segment.coupling_after for segment in limb.segments[:-1]], 1)
 
 
 @njit(cache=True)

@@ -67,21 +67,17 @@ def weight_of(limb: Limb) -> Weight:
     count = limb.segment_count
     if not gravity.any():
         return Weight(np.zeros(0), np.zeros((0, count)), gravity)
-    lengths, masses, turning = [], [], []
+    pieces: list[tuple[float, float, Array]] = []  # length, mass and turning of each
     for index, segment in enumerate(limb.segments):
+        before = (np.arange(count) < index).astype(float)
         if index and limb.connector_length:
-            before = limb.segments[index - 1].mass_per_length
-            mean = 0.5 * (before + segment.mass_per_length)
-            lengths.append(limb.connector_length)
-            masses.append(mean * limb.connector_length)
-            turning.append((np.arange(count) < index).astype(float))
-        for piece in range(_PIECES):
-            lengths.append(segment.length / _PIECES)
-            masses.append(segment.mass_per_length * segment.length / _PIECES)
-            share = (np.arange(count) < index).astype(float)
-            share[index] = (piece + 0.5) / _PIECES
-            turning.append(share)
-    length, mass = np.array(lengths), np.array(masses)
+            density = limb.segments[index - 1].mass_per_length + segment.mass_per_length
+            pieces.append((limb.connector_length, 0.5 * density * limb.connector_length, before))
+        for place in (np.arange(_PIECES) + 0.5) / _PIECES:
+            part = segment.length / _PIECES
+            share = np.where(np.arange(count) == index, place, before)
+            pieces.append((part, segment.mass_per_length * part, share))
+    length, mass, turning = map(np.array, zip(*pieces, strict=True))
     ends = limb.base_length + np.cumsum(length)
     first = 0.5 * mass * length
     for item in limb.masses:
@@ -91,7 +87,7 @@ def weight_of(limb: Limb) -> Weight:
         mass[piece] += item.mass
         first[piece] += item.mass * (item.arc_length - ends[piece] + length[piece])
     beyond = np.append(np.cumsum(mass[::-1])[::-1][1:], 0.0)
-    return Weight(first + length * beyond, np.array(turning), gravity)
+    return Weight(first + length * beyond, turning, gravity)
 
 
 @njit(cache=True)
@@ -174,13 +170,10 @@ def balance(angle: Array, law: RestingLaw, instant: Instant) -> None:
     balance of all is convex below the load that buckles the limb, so that this converges.
     """
     count = angle.shape[0]
-    torque, slope = np.empty(count), np.zeros((count, count))
+    torque, slope = np.empty(count), np.empty((count, count))
     heavy = law.weight.lever.shape[0] > 0
-    if not heavy:
-        torque[:] = 0.0
     for _ in range(_ROUNDS):
-        if heavy:
-            weigh(angle, law, torque, slope)
+        weigh(angle, law, torque, slope)
         moved, before = 0.0, angle.copy()
         for i in range(count):
             pulled = torque[i]

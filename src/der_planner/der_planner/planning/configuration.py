@@ -15,9 +15,9 @@ is solved for w by the paper's pseudo-inverse, or projected on the tangent ∂q�
 from __future__ import annotations
 
 import copy
-import dataclasses
 import math
 from abc import ABC, abstractmethod
+from dataclasses import replace
 
 import numpy as np
 from scipy.interpolate import BSpline, make_interp_spline
@@ -41,6 +41,7 @@ from der_planner.planning.loads import (
     PlanningError,
     check_load,
     check_stays,
+    held_poses,
     stable_rest,
 )
 from der_planner.planning.motions import Reference
@@ -52,7 +53,7 @@ from der_planner.planning.workspace import (
     UnreachableError,
     Workspace,
 )
-from der_planner.rod import ConvergenceError, Rod, RodState
+from der_planner.rod import RodState
 
 METHODS = {"der": ("paper", "projected", "optimal"), "pcc": ("paper", "projected", "optimal")}
 """The methods of each model. Arcs have one unknown a pressure: their two balances are the same."""
@@ -311,17 +312,14 @@ class LoadedConfiguration(RodConfiguration):
         return np.stack([q[:, 0::4], q[:, 1::4]], axis=-1)
 
     def pressures(self, method: str, time: Array) -> Array:
-        """Return effective pressures (K, M) [Pa] along the poses, see the module.
-
-        A pose rests under its own pressures: −F_int − F_ext is B Λ times these.
-        """
+        """Return effective pressures (K, M) [Pa] along the poses, see the module."""
         rod, free = self.model.rod, self.model.rod.free
-        q, v, a = sample_spline(self._shape, self._time)
+        _, v, a = sample_spline(self._shape, self._time)
+        moving = [replace(s, v=rate) for s, rate in zip(self._poses.states, v, strict=True)]
         # M q̄̈ + D q̄̇ − F_int − F_ext (K, F) [N] and B Λ (K, F, M) [N/Pa] at the poses.
-        inputs = np.array([rod.input_matrix(state)[free] for state in self._poses.states])
-        moved = rod.mass_diagonal * a + rod.damping_diagonal * v
-        moved += np.array([_viscous_force(rod, *each) for each in zip(q, v, strict=True)])
-        forces = np.einsum("kfm,km->kf", inputs, self._poses.pressures) + moved[:, free]
+        inputs = np.array([rod.input_matrix(state)[free] for state in moving])
+        supplied = np.array([rod.internal_force(state) for state in moving]) + rod.external_force
+        forces = (rod.mass_diagonal * a + rod.damping_diagonal * v - supplied)[:, free]
         if method != "paper":
             work = np.einsum("kfm,kf->km", self._poses.tangents, forces)
             by_pressure = np.einsum("kfm,kfn->kmn", self._poses.tangents, inputs)
@@ -335,24 +333,6 @@ class LoadedConfiguration(RodConfiguration):
         return self._beside_the_model(pressures, inverse[nearest], position, velocity, time)
 
 
-def _viscous_force(rod: Rod, q: Array, v: Array) -> Array:
-    """Return what Kelvin-Voigt damping of bending in the xy plane takes (4N-1,) [N]."""
-    mesh = rod.mesh
-    if not mesh.viscous.any():
-        return np.zeros_like(q)
-    dx, dy = np.diff(q[0::4]), np.diff(q[1::4])
-    edges = np.arange(len(dx))
-    # ∂(heading of an edge)/∂q, and by it that of the curvature κ = 2 tan(turn / 2) of each node.
-    heading = np.zeros((len(dx), len(q)))
-    for end, sign in ((0, 1.0), (1, -1.0)):
-        heading[edges, 4 * (edges + end)] = sign * dy / (dx**2 + dy**2)
-        heading[edges, 4 * (edges + end) + 1] = -sign * dx / (dx**2 + dy**2)
-    turn = np.diff(np.unwrap(np.arctan2(dy, dx)), prepend=0.0)
-    growth = 1.0 + np.tan(0.5 * turn) ** 2
-    curving = growth[:, None] * np.diff(heading, axis=0, prepend=0.0)
-    return curving.T @ (mesh.viscous[:-1] * (curving @ v))
-
-
 def interpolate_smoothly(time: Array, instants: Array, values: Array) -> Array:
     """Return values (K, M) at instants (K,) as (…, M) at others, by a spline."""
     return sample_spline(resting_spline(instants, values), time)[0]
@@ -363,7 +343,7 @@ def _through(time: Array, values: Array, start: Start | None) -> BSpline:
     if start is None:
         return resting_spline(time, values)
     passing = make_interp_spline(time, values, k=5)
-    begin = dataclasses.replace(start, rate=passing(0.0, 1), acceleration=passing(0.0, 2))
+    begin = replace(start, rate=passing(0.0, 1), acceleration=passing(0.0, 2))
     return resting_spline(time, values, begin)
 
 
@@ -395,15 +375,8 @@ def _find_poses(model: RodModel, time: Array, tip: Array, guess: Array) -> Poses
         BucklingError: the rod would buckle or snap through on the way.
         UnreachableError: a pose misses its point.
     """
-    try:
-        poses = PoseFinder(model, REFERENCE_PRIOR).along(stable_rest(model), tip, guess)
-    except ConvergenceError as error:
-        raise BucklingError(
-            f"no pose of the limb leads on to its tip at ({tip[error.step, 0]:.4f}, "
-            f"{tip[error.step, 1]:.4f}) m at t = {time[error.step]:.2f} s: it would buckle or snap "
-            "through under its load. Shrink or move the motion, or mount the limb otherwise",
-            tip[error.step],
-        ) from error
+    finder = PoseFinder(model, REFERENCE_PRIOR)
+    poses = held_poses(finder, stable_rest(model), time, tip, guess)
     check_stays(poses.smallest_stiffness, time, tip, "limb")
     missed = poses.misses > _POSE_TOLERANCE * model.limb.length
     if missed.any() and model.inputs > 1:

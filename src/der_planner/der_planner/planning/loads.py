@@ -14,6 +14,7 @@ import numpy as np
 from der_planner.arrays import Array
 from der_planner.limb import PAYLOAD, Limb
 from der_planner.model import AnyModel, RodModel
+from der_planner.model.rod import PoseFinder, Poses
 from der_planner.rod import ConvergenceError, Rod, RodState
 
 NEAR = 1.1
@@ -98,6 +99,24 @@ def stable_rest(model: RodModel) -> RodState:
     if model.limb.gravity[0] < 0 and _has_a_mirror_image(rod, state):
         raise BucklingError(_said(model, "may fall to either side under its loads"))
     return state
+
+
+def held_poses(finder: PoseFinder, start: RodState, time: Array, tip: Array, guess: Array) -> Poses:
+    """Return poses for tips (K, 2) [m] near bend angles (K, M) [rad] at times (K,) [s].
+
+    Raises:
+        BucklingError: the rod would buckle or snap through on the way.
+    """
+    try:
+        return finder.along(start, tip, guess)
+    except ConvergenceError as error:
+        x, y = tip[error.step]
+        raise BucklingError(
+            f"no pose of the limb leads on to its tip at ({x:.4f}, {y:.4f}) m at "
+            f"t = {time[error.step]:.2f} s: it would buckle or snap through under its load. Shrink "
+            "or move the motion, or mount the limb otherwise",
+            tip[error.step],
+        ) from error
 
 
 def _has_a_mirror_image(rod: Rod, state: RodState) -> bool:

@@ -19,7 +19,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy import sparse
 from scipy.interpolate import PchipInterpolator
 from scipy.linalg import solveh_banded
 
@@ -184,18 +184,24 @@ def _sampled(path: TipPath, samples: int) -> tuple[Array, Array]:
 def _smoothed(points: Array, step: float, wave: float) -> Array:
     """Return points (K, 2), `step` apart, with waves of length `wave` at half of their height."""
     weight = (wave / (2 * np.pi * step)) ** 4
-    band = _second_differences(len(points)) * weight
+    differences = _second_differences(len(points))
+    band = weight * _banded(differences.T @ differences, 3)
     band[0] += 1.0
     return solveh_banded(band, points, lower=True)
 
 
-def _second_differences(count: int) -> Array:
-    """Return DᵀD (3, K) of the second differences D, in lower banded form."""
-    band = np.zeros((3, count))
-    for offset, first in ((0, 1.0), (1, -2.0), (2, 1.0)):
-        for other, second in ((0, 1.0), (1, -2.0), (2, 1.0)):
-            if other >= offset:
-                band[other - offset, offset : count - 2 + offset] += first * second
+def _second_differences(count: int) -> sparse.csr_array:
+    """Return the matrix (K − 2, K) of second differences."""
+    offsets, shape = [0, 1, 2], (count - 2, count)
+    return sparse.diags_array([1.0, -2.0, 1.0], offsets=offsets, shape=shape, format="csr")
+
+
+def _banded(matrix: sparse.csr_array, rows: int) -> Array:
+    """Return the lower band (rows, n) of a symmetric matrix, as `solveh_banded` takes it."""
+    diagonals, band = matrix.todia(), np.zeros((rows, matrix.shape[0]))
+    for offset, values in zip(diagonals.offsets, diagonals.data, strict=True):
+        if offset <= 0:
+            band[-offset, : len(values)] = values
     return band
 
 
@@ -210,7 +216,8 @@ class _Search:
         self._low, self._high = middle - half, middle + half
         self._limit = workspace.pressure_limit * (1 - RESERVE)
         weakest = _WEAKEST * workspace.limb.length
-        self._smooth = weakest**2 * (TIMED_WAVE / (2 * np.pi * step)) ** 4
+        smoothing = sparse.kron(_second_differences(len(target)), sparse.eye_array(self._count))
+        self._smoothing = weakest * (TIMED_WAVE / (2 * np.pi * step)) ** 2 * smoothing.tocsr()
 
     def run(self) -> Array:
         """Search coarsely, then finely."""
@@ -250,23 +257,29 @@ class _Search:
 
     def _fine(self, angles: Array) -> Array:
         """Return the angles (K, M) at the minimum that lies nearest to the given ones."""
-        damping = 1e-6
-        present = self._cost(angles)
+        damping, missed = 1e-6, self._misses(angles)
         for _ in range(_ITERATIONS):
-            band, slope = self._normal_equations(angles)
+            slopes = self._slopes(angles)
+            slope = (slopes.T @ missed).reshape(angles.shape)
             tied = ((angles <= self._low) & (slope > 0)) | ((angles >= self._high) & (slope < 0))
+            # An angle that a limit holds changes nothing, and stays.
+            slopes = slopes @ sparse.diags_array((~tied).ravel().astype(float))
+            band = _banded(slopes.T @ slopes, 2 * self._count + 1)
+            band[0] += tied.ravel()
             while damping < 1e3:
-                step = _free_step(band, slope, tied, damping)
-                moved = np.clip(angles + step, self._low, self._high)
-                cost = self._cost(moved)
-                if cost <= present:
+                matrix = band.copy()
+                matrix[0] += damping * max(float(band[0].max()), 1e-12)
+                step = solveh_banded(matrix, np.where(tied, 0.0, -slope).ravel(), lower=True)
+                moved = np.clip(angles + step.reshape(angles.shape), self._low, self._high)
+                new = self._misses(moved)
+                if new @ new <= missed @ missed:
                     break
                 damping *= 10
             else:
                 break
-            gain, change = present - cost, np.abs(moved - angles).max()
-            angles, present, damping = moved, cost, max(damping / 10, 1e-9)
-            if change < 1e-6 or gain <= 1e-7 * present:
+            gain, change = missed @ missed - new @ new, np.abs(moved - angles).max()
+            angles, missed, damping = moved, new, max(damping / 10, 1e-9)
+            if change < 1e-6 or gain <= 1e-7 * (new @ new):
                 break
         return angles
 
@@ -276,38 +289,24 @@ class _Search:
         beyond: Array = _EXCESS * np.sign(pressure) * np.maximum(np.abs(pressure) - 1, 0.0)
         return beyond
 
-    def _cost(self, angles: Array) -> float:
+    def _misses(self, angles: Array) -> Array:
+        """Return what is to be small: pose by pose tip (2) and excess (M) [m], then all bends."""
         missed = self._kinematics.tip(angles) - self._target
-        bend = np.diff(angles, n=2, axis=0)
-        beyond = self._excess(angles)
-        return float((missed**2).sum() + self._smooth * (bend**2).sum() + (beyond**2).sum())
+        near = np.concatenate([missed, self._excess(angles)], axis=1)
+        return np.concatenate([near.ravel(), self._smoothing @ angles.ravel()])
 
-    def _normal_equations(self, angles: Array) -> tuple[Array, Array]:
-        """Return JᵀJ in lower banded form (2M + 1, K·M) and half the gradient (K, M)."""
+    def _slopes(self, angles: Array) -> sparse.csr_array:
+        """Return ∂(misses)/∂(angles)."""
         count, inputs = angles.shape
-        jacobian = self._kinematics.tip_jacobians(angles)
-        missed = self._kinematics.tip(angles) - self._target
-        block = np.einsum("kai,kaj->kij", jacobian, jacobian)
-        slope = np.einsum("kai,ka->ki", jacobian, missed)
+        by_angle = np.zeros((count, inputs, inputs))
         beyond = self._excess(angles)
         if beyond.any():
             nudge = 1e-6 * np.eye(inputs)
             columns = [(self._excess(angles + part) - beyond) / 1e-6 for part in nudge]
-            change = np.stack(columns, axis=-1)
-            block += np.einsum("kai,kaj->kij", change, change)
-            slope += np.einsum("kai,ka->ki", change, beyond)
-        smooth = _second_differences(count) * self._smooth
-        band = np.zeros((2 * inputs + 1, count * inputs))
-        for below in range(inputs):
-            for column in range(inputs - below):
-                band[below, column::inputs] = block[:, column + below, column]
-        for apart in range(3):
-            band[apart * inputs] += np.repeat(smooth[apart], inputs)
-        bend = np.diff(angles, n=2, axis=0) * self._smooth
-        slope[:-2] += bend
-        slope[1:-1] -= 2 * bend
-        slope[2:] += bend
-        return band, slope
+            by_angle = np.stack(columns, axis=-1)
+        blocks = np.concatenate([self._kinematics.tip_jacobians(angles), by_angle], axis=1)
+        near = sparse.bsr_array((blocks, np.arange(count), np.arange(count + 1)))
+        return sparse.csr_array(sparse.vstack([near, self._smoothing]))
 
 
 def _cheapest(total: Array, origin: Array, travel: Array, axis: int) -> tuple[Array, Array]:
@@ -320,18 +319,6 @@ def _cheapest(total: Array, origin: Array, travel: Array, axis: int) -> tuple[Ar
         np.moveaxis(least, -1, axis),
         np.moveaxis(np.take_along_axis(sources, best, axis=-1), -1, axis),
     )
-
-
-def _free_step(band: Array, slope: Array, tied: NDArray[np.bool_], damping: float) -> Array:
-    """Return the Gauss-Newton step (K, M) of the angles that no limit holds."""
-    matrix, still = band.copy(), tied.ravel()
-    matrix[0] += damping * max(float(band[0].max()), 1e-12)
-    for below in range(1, len(matrix)):
-        either = still[: -below or None] | still[below:]
-        matrix[below, : len(either)][either] = 0.0
-    matrix[0][still] = 1.0
-    right = np.where(still, 0.0, -slope.ravel())
-    return solveh_banded(matrix, right, lower=True).reshape(slope.shape)
 
 
 def _deviation(drawn: Array, tip: Array, when: Array, slowed: float) -> Deviation:

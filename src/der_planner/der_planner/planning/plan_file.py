@@ -30,8 +30,9 @@ SCHEMA_VERSION = 1
 SUFFIX = ".yaml"
 _SAME = 1e-9
 """Relative difference of two numbers of limbs that are the same."""
-_NAMES = ("motion", "model", "method")
-_NUMBERS = ("amplitude", "period", "cycles", "solve_time")
+_SINGLE: dict[str, type] = dict.fromkeys(("motion", "model", "method"), str)
+_SINGLE |= {"amplitude": float, "period": float, "cycles": int, "solve_time": float}
+"""What a file has of a plan beside its rows."""
 
 
 @dataclass(frozen=True)
@@ -129,7 +130,7 @@ def write_plan(plan: Plan, path: str | Path, about: Mapping[str, Any] | None = N
     start = plan.reference.start
     content: dict[str, Any] = {
         "schema_version": SCHEMA_VERSION,
-        **{name: getattr(plan, name) for name in (*_NAMES, *_NUMBERS)},
+        **{name: getattr(plan, name) for name in _SINGLE},
         "nodes": plan.body.nodes,
         "about": dict(about or {}),
         "limb": plan.limb.to_mapping(),
@@ -199,15 +200,9 @@ def _plan_of(content: Any) -> Plan:
         reference=reference,
         tip_predicted=predicted,
         bend_angles=bend,
-        motion=str(content["motion"]),
-        model=str(content["model"]),
-        method=str(content["method"]),
-        amplitude=float(content["amplitude"]),
-        period=float(content["period"]),
-        cycles=int(content["cycles"]),
         body=body,
-        solve_time=float(content["solve_time"]),
         chambers_beyond=beyond,
+        **{name: kind(content[name]) for name, kind in _SINGLE.items()},
     )
 
 

@@ -21,8 +21,7 @@ from der_planner.arrays import Array, interpolate
 from der_planner.model import NODES, ArcModel, Model, RodModel
 from der_planner.model.bending import Kinematics, inverse_kinematics
 from der_planner.model.rod import PoseFinder
-from der_planner.planning.loads import BucklingError, PlanningError, stable_rest
-from der_planner.rod import ConvergenceError
+from der_planner.planning.loads import PlanningError, held_poses, stable_rest
 
 TOLERANCE = 1e-3
 """Points missed by less than this [m] count as reached (the models' reach differs by less)."""
@@ -174,15 +173,8 @@ class Workspace:
         instants = np.linspace(time[0], time[-1], count)
         beside = self.rod.bend_of(state) - self.rest.bend_angles
         wanted = interpolate(instants, time, angles) + beside
-        holder = PoseFinder(self.rod, prior=1.0, tip_weight=0.0)
-        try:
-            poses = holder.along(state, np.tile(state.q[-3:-1], (count, 1)), wanted)
-        except ConvergenceError as error:
-            raise BucklingError(
-                f"the limb cannot be held at t = {instants[error.step]:.2f} s: under its load it "
-                "would snap through. Shrink the motion, or mount the limb otherwise",
-                self.arcs.tip(wanted[error.step]),
-            ) from error
+        finder = PoseFinder(self.rod, prior=1.0, tip_weight=0.0)
+        poses = held_poses(finder, state, instants, self.arcs.tip(wanted), wanted)
         tips = np.array([state.q[-3:-1] for state in poses.states])
         return make_interp_spline(instants, tips, k=5)(time)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,6 +18,8 @@ from der_planner.arrays import Array
 from der_planner.rod import banded_kernel, step_kernel
 from der_planner.rod.mesh import Mesh
 from der_planner.rod.step_kernel import Base, Body, Place, Record, Solver
+
+_NO_FRAMES = Base(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
 
 
 @dataclass(frozen=True)
@@ -95,7 +97,7 @@ class Backend(ABC):
     """What integration, linearisation and statics need of a rod; planar or spatial.
 
     Attributes:
-        mesh: the numbers of the rod.
+        mesh: the numbers of the rod. length: of all its edges [m].
         index: indices into q of the coordinates that the kernels have.
         offset: unknowns of the ghost node, before those of q.
         size: n, unknowns of the kernels.
@@ -115,7 +117,7 @@ class Backend(ABC):
     rod: Any
 
     def __init__(self, mesh: Mesh, index: NDArray[np.int64]) -> None:
-        self.mesh = mesh
+        self.mesh, self.length = mesh, float(mesh.rest.sum())
         self.index = index
         self.offset = self.unknowns_per_node * int(mesh.ghost)
         self.size = len(index) + self.offset
@@ -133,17 +135,17 @@ class Backend(ABC):
     def work_space(self, base: Base) -> Any:
         """Return new work arrays for kernels that start from these frames."""
 
-    @abstractmethod
-    def frames(self, state: RodState) -> Base:
+    def frames(self, state: RodState) -> Base:  # noqa: ARG002 - a plane has none
         """Return copies of the reference frames of a state, with the ghost edge's."""
+        return _NO_FRAMES
 
-    @abstractmethod
-    def public_state(self, q: Array, v: Array, base: Base, like: RodState) -> RodState:
+    def public_state(self, q: Array, v: Array, base: Base, like: RodState) -> RodState:  # noqa: ARG002
         """Return the state at q, v with frames of the kernels, or as in `like` in a plane."""
+        return replace(like, q=q, v=v)
 
     def carry_frames(self, base: RodState, q: Array, v: Array) -> RodState:
         """Return a state at q whose frames are those of `base`, transported where they turn."""
-        return RodState(q, v, base.directors, base.reference_twist)
+        return replace(base, q=q, v=v)
 
     @abstractmethod
     def framed(self, state: RodState) -> tuple[Array, Any, Array]:
@@ -222,7 +224,7 @@ class Backend(ABC):
         """Return the numbers of the rod under a load (4N-1,) [N]."""
         return self.rod._replace(body=self.rod.body._replace(load=self.rates(load)))
 
-    def new_record(self, solves: int) -> Record:
+    def _new_record(self, solves: int) -> Record:
         """Return an unfilled record of so many solves."""
         band = (self.size, 5 * self.unknowns_per_node + 1)
         edges = self.turning_edges
@@ -237,9 +239,11 @@ class Backend(ABC):
 
     def simulate(
         self, place: Place, motion: tuple[Array, Array], pressures: Array, begin: int,
-        solver: Solver, load: Array, record: Record,
+        solver: Solver, load: Array, linearise: bool,
     ) -> Piece:  # fmt: skip
         """Run the kernel from step `begin` on; motion is where positions and velocities go."""
+        left = pressures.shape[0] * pressures.shape[1] - begin
+        record = self._new_record(left * len(solver.extrapolate) if linearise else 0)
         space = self.work_space(place.base)
         done, iterations, update, failed = self.kernels.simulate(
             motion, place, pressures, begin, solver, record, space, self.loaded(load)
@@ -251,7 +255,6 @@ class Backend(ABC):
     ) -> tuple[RodState, int, float]:
         """Solve the balance of forces from `start`; iterations are negative without convergence."""
         x, base = self.unknowns(start.q), self.frames(start)
-        solver = solver._replace(lever=self.lever)
         iterations, update = self.kernels.newton(
             x, x.copy(), np.zeros(self.size), 0.0, u, solver, self.work_space(base),
             self.loaded(load),
@@ -283,17 +286,22 @@ class Backend(ABC):
         x, space, _ = self.framed(state)
         return float(self.kernels.energy(x, space, self.rod))
 
-    def gradient_and_hessian(self, state: RodState) -> tuple[Array, Array]:
-        """Return ∇E (4N-1,) and ∇²E (4N-1, 4N-1), frames re-based at the state.
+    def internal_force(self, state: RodState) -> Array:
+        """Return the elastic and viscous force (4N-1,) of a moving state."""
+        return -self.full(self._assembled(state, self.rates(state.v))[0])
 
-        Entries off a plane are zero.
-        """
-        x, space, _ = self.framed(state)
-        gradient, still = np.zeros((2, self.size))
-        unpressed = np.zeros(len(self.mesh.gain))
-        self.kernels.assemble(x, still, 0.0, unpressed, False, gradient, space, self.rod)
+    def stiffness(self, state: RodState) -> Array:
+        """Return ∇²E (4N-1, 4N-1), frames re-based at the state; entries off a plane are zero."""
+        _, space = self._assembled(state, np.zeros(self.size))
         banded_kernel.expand(space.s, space.a)
-        return self.full(gradient), self.full_matrix(general_band_to_dense(space.a))
+        return self.full_matrix(general_band_to_dense(space.a))
+
+    def _assembled(self, state: RodState, v: Array) -> tuple[Array, Any]:
+        """Return ∇E with the viscous force at velocities v (n,), and the work space then."""
+        x, space, _ = self.framed(state)
+        gradient, unpressed = np.zeros(self.size), np.zeros(len(self.mesh.gain))
+        self.kernels.assemble(x, v, 0.0, unpressed, False, gradient, space, self.rod)
+        return gradient, space
 
     def input_matrix(self, state: RodState) -> Array:
         """Return B(q)Λ (4N-1, M)."""
@@ -306,9 +314,7 @@ class Backend(ABC):
 def general_band_to_dense(band: Array) -> Array:
     """Return the full matrix of a general band stored by rows."""
     size, width = band.shape
-    half = (width - 1) // 2
-    result = np.zeros((size, size))
-    for row in range(size):
-        first, last = max(0, row - half), min(size, row + half + 1)
-        result[row, first:last] = band[row, first - row + half : last - row + half]
-    return result
+    wide = np.zeros((size, size + width - 1))
+    rows = np.arange(size)[:, None]
+    wide[rows, rows + np.arange(width)] = band
+    return wide[:, width // 2 : width // 2 + size]

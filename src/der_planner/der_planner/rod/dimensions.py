@@ -16,8 +16,6 @@ from der_planner.rod.spatial import step_kernel as spatial_step
 from der_planner.rod.spatial.elastic_kernel import SpatialRod, SpatialSpace
 from der_planner.rod.step_kernel import Base
 
-_NO_FRAMES = Base(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
-
 
 class PlanarBackend(Backend):
     """Kernels and arrays of a planar rod; frames do not matter there and stay as they are."""
@@ -37,7 +35,7 @@ class PlanarBackend(Backend):
             gain=mesh.gain if plane == "xy" else np.zeros_like(mesh.gain),
         )
 
-    def work_space(self, base: Base = _NO_FRAMES) -> PlanarSpace:  # noqa: ARG002 - no frames
+    def work_space(self, base: Base) -> PlanarSpace:  # noqa: ARG002 - no frames
         """Return new work arrays."""
         n = self.size // 2
         x, v, acceleration, residual, x_start, v_start = np.zeros((6, self.size))
@@ -48,23 +46,9 @@ class PlanarBackend(Backend):
             torque=np.zeros((n, 2)), parts=np.zeros((2, 6)),
         )  # fmt: skip
 
-    def frames(self, state: RodState) -> Base:  # noqa: ARG002 - a plane needs none
-        """Return no frames."""
-        return _NO_FRAMES
-
-    def public_state(
-        self,
-        q: Array,
-        v: Array,
-        base: Base,  # noqa: ARG002 - a plane has none
-        like: RodState,
-    ) -> RodState:
-        """Return the state at q, v with the frames of `like`."""
-        return RodState(q, v, like.directors, like.reference_twist)
-
     def framed(self, state: RodState) -> tuple[Array, PlanarSpace, Array]:
         """Return the unknowns of a state, a work space of it, and its edges."""
-        x, space = self.unknowns(state.q), self.work_space()
+        x, space = self.unknowns(state.q), self.work_space(self.frames(state))
         planar_elastic.edges_and_turns(x, space.edge, space.turn)
         return x, space, space.edge
 
@@ -81,7 +65,7 @@ class SpatialBackend(Backend):
     def __init__(self, mesh: Mesh) -> None:
         super().__init__(mesh, np.arange(4 * mesh.nodes - 1))
         self.turning_edges = mesh.nodes - 1 + int(mesh.ghost)
-        self.lever = 0.1 * float(mesh.rest.sum())
+        self.lever = 0.1 * self.length
         self.rod = SpatialRod(
             **self.numbers(),
             twist=self.ghosted(mesh.twist),

@@ -7,8 +7,8 @@ state is found by Newton's method, with load stepping where that fails.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
-from typing import Literal, NamedTuple
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,7 +17,7 @@ from der_planner.arrays import Array
 from der_planner.rod import step_kernel
 from der_planner.rod.backend import Backend, ConvergenceError, Piece, RodState, positions_of
 from der_planner.rod.mesh import array, by_step, require
-from der_planner.rod.step_kernel import Place, Record, SolveChain, Solver
+from der_planner.rod.step_kernel import Record, SolveChain, Solver
 
 Method = Literal["sdirk2", "midpoint", "backward_euler"]
 
@@ -31,21 +31,6 @@ _STAGES = {
     "midpoint": (0.5, np.array([2.0])),
     "sdirk2": (_GAMMA, np.array([(1.0 - _GAMMA) / _GAMMA, 1.0])),
 }
-
-
-class Solved(NamedTuple):
-    """The recorded solves of a simulation in their order; a step that was cut has more of them.
-
-    Attributes:
-        record: the linearisation of each solve.
-        rates: (solves,) 1/h. extrapolate: (solves,) e.
-        steps: (solves,) index of the integrator step that each belongs to.
-    """
-
-    record: Record
-    rates: Array
-    extrapolate: Array
-    steps: NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -151,162 +136,104 @@ class Trajectory:
         return self.q[:, -3:].copy()
 
 
-def chain_of(backend: Backend, solved: Solved, rows: NDArray[np.int64]) -> SolveChain:
-    """Return recorded solves as the kernels take them."""
-    mass, damping = backend.mass.copy(), backend.damping.copy()
-    mass[backend.fixed] = damping[backend.fixed] = 0.0
-    return SolveChain(
-        solved.record, mass, damping, solved.rates, solved.extrapolate, solved.steps, rows
-    )
-
-
-def step_matrices(backend: Backend, solved: Solved) -> tuple[Array, Array]:
-    """Return A (2F, 2F) and B (2F, M) of all recorded solves under one input."""
-    rows = backend.free_rows
-    chain = chain_of(backend, solved, rows)
-    count = len(rows)
-    shape = (backend.size, 2 * count + solved.record.inputs.shape[2])
+def step_matrices(chain: SolveChain) -> tuple[Array, Array]:
+    """Return A (2F, 2F) and B (2F, M) of all solves under one input; their outputs are free."""
+    rows, count = chain.outputs, len(chain.outputs)
+    shape = (len(chain.mass), 2 * count + chain.record.inputs.shape[2])
     dq, dv, before = np.zeros(shape), np.zeros(shape), np.zeros(shape)
     dq[rows, np.arange(count)] = 1.0
     dv[rows, np.arange(count, 2 * count)] = 1.0
-    for solve in range(len(solved.steps)):
+    for solve in range(len(chain.steps)):
         y = np.zeros(shape)
-        y[:, 2 * count :] = solved.record.inputs[solve]
+        y[:, 2 * count :] = chain.record.inputs[solve]
         step_kernel.advance(solve, dq, dv, y, before, chain)
     both = np.concatenate([dq[rows], dv[rows]])
     return both[:, : 2 * count], both[:, 2 * count :]
 
 
-@dataclass
-class _Journey:
-    """A run under way: its beginning, its state and its recorded samples."""
+def integrate(
+    backend: Backend, state: RodState, pressures: Array, dt: float, method: str, load: Array,
+    outputs: NDArray[np.int64] | None = None, halvings: int = 0,
+) -> tuple[Trajectory, SolveChain | None]:  # fmt: skip
+    """Run K intervals of S steps of dt under pressures (K, S, M) and load (4N-1,).
 
-    begin: RodState
-    place: Place
-    load: Array
-    linearise: bool
-    method: str
-    iterations: int = 0
-    pieces: list[Solved] = field(default_factory=list)
+    A step that does not converge is taken in two parts, then in four, up to 2 ** halvings.
 
+    Returns:
+        The motion, and its solves if rows of outputs are given.
 
-class Integrator:
-    """Runs a backend by one of the methods."""
-
-    def __init__(self, backend: Backend) -> None:
-        self._backend = backend
-        self._length = float(backend.mesh.rest.sum())
-
-    def run(
-        self, state: RodState, pressures: Array, dt: float, method: str, load: Array,
-        linearise: bool = False, halvings: int = 0,
-    ) -> tuple[Trajectory, Solved | None]:  # fmt: skip
-        """Run K intervals of S steps of dt under pressures (K, S, M) and load (4N-1,).
-
-        Returns:
-            The motion, and what its linearisation comes from, if that was asked for.
-
-        A step that does not converge is cut in two, its halves too, `halvings` times deep.
-
-        Raises:
-            ValueError: an unknown method.
-            ConvergenceError: with the step's index and the last good state.
-        """
-        backend = self._backend
-        require(method in _STAGES, "method", f"one of {sorted(_STAGES)}", method)
-        fraction, extrapolate = _STAGES[method]
-        solver = Solver(
-            dt * fraction, extrapolate, 1e-10 * self._length, backend.lever, limit=_LIMIT
-        )
-        intervals, steps, _ = pressures.shape
-        journey = _Journey(state, backend.place(state), load, linearise, method)
-        x = np.empty((intervals + 1, backend.size))
-        rate = np.empty((intervals + 1, backend.size))
-        x[0], rate[0] = journey.place.x, journey.place.v
-        begin = 0
-        while begin < intervals * steps:
-            piece = self._go(journey, (x, rate), pressures, begin, solver, None)
-            begin = piece.done
-            if not piece.failed_iterations:
-                break
-            interval, step = divmod(begin, steps)
-            self._cut(journey, pressures[interval, step], solver, halvings, halvings, begin, piece)
+    Raises:
+        ValueError: an unknown method.
+        ConvergenceError: with the step's index and the last good state.
+    """
+    require(method in _STAGES, "method", f"one of {sorted(_STAGES)}", method)
+    fraction, extrapolate = _STAGES[method]
+    solver = Solver(dt * fraction, extrapolate, 1e-10 * backend.length, backend.lever, _LIMIT)
+    intervals, steps, _ = pressures.shape
+    linearise, place = outputs is not None, backend.place(state)
+    x, rate = np.empty((2, intervals + 1, backend.size))
+    x[0], rate[0] = place.x, place.v
+    spent, begin, pieces = 0, 0, []
+    while begin < intervals * steps:
+        piece = backend.simulate(place, (x, rate), pressures, begin, solver, load, linearise)
+        if linearise:
+            pieces.append(_recorded(piece, solver, np.arange(begin, piece.done)))
+        spent, begin, parts = spent + piece.iterations, piece.done, 1
+        before = backend.state(place, state) if piece.failed_iterations else state
+        while piece.failed_iterations:
+            if parts == 2**halvings:
+                cut = f", also in {parts} parts" if parts > 1 else ""
+                raise ConvergenceError(
+                    f"step {begin} of {dt:g} s ({method}{cut}) did not converge in "
+                    f"{piece.failed_iterations} Newton iterations "
+                    f"(last update {piece.update:.3g} m): take a shorter step",
+                    step=begin, residual=piece.update, iterations=piece.failed_iterations,
+                    state=before,
+                )  # fmt: skip
+            parts *= 2
+            place, short = backend.place(before), solver._replace(h=solver.h / parts)
+            inputs = np.repeat(pressures[divmod(begin, steps)][None, None], parts, axis=1)
+            motion = np.empty((2, backend.size)), np.empty((2, backend.size))
+            piece = backend.simulate(place, motion, inputs, 0, short, load, linearise)
+            spent += piece.iterations
+        if parts > 1:
+            if linearise:
+                pieces.append(_recorded(piece, short, np.full(parts, begin)))
             begin += 1
-            if step == steps - 1:
-                x[interval + 1], rate[interval + 1] = journey.place.x, journey.place.v
-        motion = Trajectory(
-            steps * dt * np.arange(intervals + 1), backend.restore(x, state.q),
-            backend.restore(rate, state.v), backend.state(journey.place, state), journey.iterations,
-        )  # fmt: skip
-        return motion, _joined(journey.pieces) if linearise else None
-
-    def _go(
-        self, journey: _Journey, motion: tuple[Array, Array], pressures: Array, begin: int,
-        solver: Solver, step: int | None,
-    ) -> Piece:  # fmt: skip
-        """Run the kernel from `begin` until it fails or ends, and gather what it recorded.
-
-        The solves belong to the step `step`, or without it to the steps from `begin` on.
-        """
-        stages = len(solver.extrapolate)
-        left = pressures.shape[0] * pressures.shape[1] - begin
-        record = self._backend.new_record(left * stages if journey.linearise else 0)
-        piece = self._backend.simulate(
-            journey.place, motion, pressures, begin, solver, journey.load, record
-        )
-        journey.iterations += piece.iterations
-        done = piece.done - begin
-        if journey.linearise and done:
-            owners = np.arange(begin, piece.done) if step is None else np.full(done, step)
-            journey.pieces.append(
-                Solved(
-                    record=Record(*(part[: done * stages] for part in record)),
-                    rates=np.full(done * stages, 1.0 / solver.h),
-                    extrapolate=np.tile(solver.extrapolate, done),
-                    steps=np.repeat(owners, stages),
-                )
-            )
-        return piece
-
-    def _cut(
-        self, journey: _Journey, u: Array, solver: Solver, halvings: int, allowed: int, step: int,
-        piece: Piece,
-    ) -> None:  # fmt: skip
-        """Go over a step that failed in two halves, each of which may be cut again."""
-        if halvings < 1:
-            raise self._failure(journey, solver, allowed, step, piece)
-        half = solver._replace(h=0.5 * solver.h)
-        pressures = np.ascontiguousarray(np.broadcast_to(u, (1, 2, len(u))))
-        motion = np.empty((2, self._backend.size)), np.empty((2, self._backend.size))
-        begin = 0
-        while begin < 2:
-            part = self._go(journey, motion, pressures, begin, half, step)
-            begin = part.done
-            if part.failed_iterations:
-                self._cut(journey, u, half, halvings - 1, allowed, step, part)
-                begin += 1
-
-    def _failure(
-        self, journey: _Journey, solver: Solver, allowed: int, step: int, piece: Piece
-    ) -> ConvergenceError:
-        whole = solver.h / _STAGES[journey.method][0] * 2**allowed
-        parts = f", also in {2**allowed} parts" if allowed else ""
-        place = self._backend.state(journey.place, journey.begin)
-        return ConvergenceError(
-            f"step {step} of {whole:g} s ({journey.method}{parts}) did not converge in "
-            f"{piece.failed_iterations} Newton iterations "
-            f"(last update {piece.update:.3g} m): take a shorter step",
-            step=step, residual=piece.update, iterations=piece.failed_iterations, state=place,
-        )  # fmt: skip
+            if begin % steps == 0:
+                x[begin // steps], rate[begin // steps] = place.x, place.v
+    trajectory = Trajectory(
+        steps * dt * np.arange(intervals + 1), backend.restore(x, state.q),
+        backend.restore(rate, state.v), backend.state(place, state), spent,
+    )  # fmt: skip
+    return trajectory, None if outputs is None else _chain(backend, pieces, outputs)
 
 
-def _joined(pieces: list[Solved]) -> Solved:
-    """Join the pieces of a run's linearisation."""
-    if len(pieces) == 1:
-        return pieces[0]
-    records, *others = zip(*pieces, strict=True)
-    record = Record(*(np.concatenate(parts) for parts in zip(*records, strict=True)))
-    return Solved(record, *map(np.concatenate, others))
+def _recorded(
+    piece: Piece, solver: Solver, owners: NDArray[np.int64]
+) -> tuple[Record, Array, Array, NDArray[np.int64]]:
+    """Return what a piece recorded, as `SolveChain` has it; the steps of its solves are owners."""
+    stages = len(solver.extrapolate)
+    count = stages * len(owners)
+    record = Record(*(part[:count] for part in piece.record))
+    extrapolate = np.tile(solver.extrapolate, len(owners))
+    return record, np.full(count, 1.0 / solver.h), extrapolate, np.repeat(owners, stages)
+
+
+def _chain(
+    backend: Backend,
+    pieces: list[tuple[Record, Array, Array, NDArray[np.int64]]],
+    outputs: NDArray[np.int64],
+) -> SolveChain:
+    """Return the solves of a run, which has several pieces if steps of it were cut."""
+    mass, damping = backend.mass.copy(), backend.damping.copy()
+    mass[backend.fixed] = damping[backend.fixed] = 0.0
+    record, rates, extrapolate, steps = pieces[0]
+    if len(pieces) > 1:
+        records, *others = zip(*pieces, strict=True)
+        record = Record(*map(np.concatenate, zip(*records, strict=True)))
+        rates, extrapolate, steps = map(np.concatenate, others)
+    return SolveChain(record, mass, damping, rates, extrapolate, steps, outputs)
 
 
 def find_equilibrium(backend: Backend, start: RodState, u: Array, load: Array) -> RodState:
@@ -318,11 +245,10 @@ def find_equilibrium(backend: Backend, start: RodState, u: Array, load: Array) -
     Raises:
         ConvergenceError: the parts became too small.
     """
-    edges = backend.mesh.rest
-    length = float(edges.sum())
+    edges, length = backend.mesh.rest, backend.length
     # An iteration moves nodes by at most twice the shortest edge.
     limit = _STATIC_LIMIT + round(0.5 * length * float(1.0 / edges.min() - 1.0 / edges.mean()))
-    solver = Solver(h=1.0, extrapolate=np.ones(1), tolerance=1e-11 * length, lever=0.0, limit=limit)
+    solver = Solver(1.0, np.ones(1), 1e-11 * length, backend.lever, limit)
     state, iterations, update = backend.solve_static(start, u, load, solver)
     if iterations > 0:
         return state

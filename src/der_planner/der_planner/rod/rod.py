@@ -14,12 +14,11 @@ from der_planner.limb import Limb
 from der_planner.rod.backend import RodState, positions_of
 from der_planner.rod.dimensions import PlanarBackend, SpatialBackend
 from der_planner.rod.integration import (
-    Integrator,
     Linearisation,
     Method,
     Trajectory,
-    chain_of,
     find_equilibrium,
+    integrate,
     step_matrices,
 )
 from der_planner.rod.mesh import (
@@ -73,7 +72,6 @@ class Rod:
         self.external_force = mesh.weight
         self._backend = PlanarBackend(mesh, plane) if plane else SpatialBackend(mesh)
         self.free = self._backend.free
-        self._integrator = Integrator(self._backend)
         if plane:
             self._check_plane(self.external_force, "gravity")
 
@@ -254,8 +252,9 @@ class Rod:
     ) -> Trajectory:
         """Run K intervals of length dt in one compiled loop, each in `substeps` equal steps.
 
-        A step that does not converge is cut in two, and its halves again: a rod that is stiff or
-        fast for its step costs time. The linearisation is that of the steps as they were cut.
+        A step that does not converge is taken in two parts, then in four and so on: a rod that is
+        stiff or fast for its step costs time. The linearisation is that of the steps as they were
+        cut.
 
         Args:
             state: initial state.
@@ -268,7 +267,7 @@ class Rod:
                 has `.tangent(pressure change) -> output change` and `.sensitivity(pulse=None)`
                 (K+1, P, K, M), both compiled.
             outputs: (P,) indices into q of the outputs; default the tip's free coordinates.
-            halvings: how often a step may be cut in two; 0 means never.
+            halvings: how often the parts of a step may be halved; 0 means never.
 
         Raises:
             ConvergenceError: a step did not converge, however short; with its index and the last
@@ -277,11 +276,11 @@ class Rod:
         inputs = by_step(pressures, substeps, self.segment_count)
         h = positive(dt, "dt") / substeps
         load = self._load(forces)
-        motion, solved = self._integrator.run(state, inputs, h, method, load, linearise, halvings)
-        if solved is None:
+        wanted = self.output_indices(outputs) if linearise else None
+        rows = None if wanted is None else self._backend.rows(wanted)
+        motion, chain = integrate(self._backend, state, inputs, h, method, load, rows, halvings)
+        if chain is None or wanted is None:
             return motion
-        wanted = self.output_indices(outputs)
-        chain = chain_of(self._backend, solved, self._backend.rows(wanted))
         linear = Linearisation(len(inputs), substeps, wanted, chain, self._backend.free_rows)
         return replace(motion, linearisation=linear)
 
@@ -310,12 +309,12 @@ class Rod:
         return self._backend.energy(self._as_state(state))
 
     def internal_force(self, state: RodState | ArrayLike) -> Array:
-        """Return the elastic force −∇E (4N-1,) [N, N·m]."""
-        return -self._backend.gradient_and_hessian(self._as_state(state))[0]
+        """Return the elastic force −∇E and that of Kelvin-Voigt damping (4N-1,) [N, N·m]."""
+        return self._backend.internal_force(self._as_state(state))
 
     def stiffness(self, state: RodState | ArrayLike) -> Array:
         """Return the elastic Hessian ∇²E (4N-1, 4N-1) [N/m …]."""
-        return self._backend.gradient_and_hessian(self._as_state(state))[1]
+        return self._backend.stiffness(self._as_state(state))
 
     def input_matrix(self, state: RodState | ArrayLike) -> Array:
         """Return B(q)Λ (4N-1, M) [N/Pa]: unit couples times Λ; rows of φ are zero."""
@@ -346,11 +345,12 @@ class Rod:
         beginning and of the step's result at the end: what `Rod.state(q, like=…)` does.
         """
         pressures = array(u, (self.segment_count,), "u")[None, None, :]
-        _, solved = self._integrator.run(
-            state, pressures, positive(dt, "dt"), method, self.external_force, linearise=True
+        rows, load = self._backend.free_rows, self.external_force
+        _, chain = integrate(
+            self._backend, state, pressures, positive(dt, "dt"), method, load, rows
         )
-        assert solved is not None  # since it was linearised
-        return step_matrices(self._backend, solved)
+        assert chain is not None  # since it was linearised
+        return step_matrices(chain)
 
     def _load(self, forces: ArrayLike | None) -> Array:
         if forces is None:

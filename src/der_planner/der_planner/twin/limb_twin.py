@@ -89,13 +89,11 @@ class LimbTwin:
         self._ramp_left = 0
         self._wander_noise = np.random.default_rng([7_919, seed, run])
         self._pegs = Pegs(np.empty((0, 3)), np.empty(0), np.empty((0, 3, 1)))
-        body = build(self._hardware)
-        rod = self._rod = body.rod
-        self._arrays, self._material = body.arrays, body.material
-        self._node_arc = body.node_arc
-        self._element_segment, self._vertex_segment = body.element_segment, body.vertex_segment
-        self._rigid_elements = np.nonzero(self._element_segment < 0)[0]
-        self._loads = NodeLoads(self._node_arc, rod.mass, rod.external_forces, gravity)
+        self._body = build(self._hardware)
+        rod = self._rod = self._body.rod
+        self._material = self._body.material
+        self._rigid_elements = np.nonzero(self._body.element_segment < 0)[0]
+        self._loads = NodeLoads(self._body.node_arc, rod.mass, rod.external_forces, gravity)
         for item in masses:
             self.push(Push(-math.inf, item.arc_length, mass=item.mass))
         self._wander = np.array([s.wander for s in self._hardware.segments])
@@ -145,7 +143,7 @@ class LimbTwin:
             left = (self._loads.next_change(self.time) - self.time) / TIME_STEP
             count = math.ceil(min(steps, left))
             drag = self._hardware.drag
-            advance(self._arrays, self._material, ramp, self._pegs, count, TIME_STEP, drag)
+            advance(self._body.arrays, self._material, ramp, self._pegs, count, TIME_STEP, drag)
             ramp = ramp._replace(steps=max(0, ramp.steps - count))
             steps -= count
             self.time += count * TIME_STEP
@@ -173,7 +171,7 @@ class LimbTwin:
         """
         x, y, radius = np.asarray(pegs, dtype=float).reshape(-1, 3).T
         centre = np.stack([x, y, np.zeros_like(x)], axis=1)
-        points = self.shape(200).points
+        points = self.shape().points
         for peg, size in zip(centre[:, :2], radius, strict=True):
             if np.linalg.norm(points - peg, axis=1).min() < RADIUS + size:
                 raise TwinError(
@@ -182,38 +180,22 @@ class LimbTwin:
                 )
         self._pegs = Pegs(centre, np.ascontiguousarray(radius), np.zeros((len(centre), 3, 1)))
 
-    def shape(self, points: int = 0) -> TwinShape:
-        """Return the true centreline.
+    def shape(self) -> TwinShape:
+        """Return the true centreline at the nodes and in the middle of each element.
 
-        Args:
-            points: number of equally spaced points; 0 gives the nodes and the middle of each
-                element.
-
-        Returns:
-            Interpolated between nodes by cubic Hermite pieces along the material tangents.
+        The middles are those of cubic Hermite pieces along the material tangents.
         """
-        node_arc = self._node_arc
-        arc = (
-            np.sort(np.concatenate([node_arc, 0.5 * (node_arc[1:] + node_arc[:-1])]))
-            if points == 0
-            else np.linspace(0.0, node_arc[-1], points)
-        )
-        heading = self._node_headings()
+        arc, heading = self._body.node_arc, self._node_headings()
         nodes = self._rod.position_collection[:2].T
-        stretch = np.linalg.norm(np.diff(nodes, axis=0), axis=1) / np.diff(node_arc)
-        index = np.clip(np.searchsorted(node_arc, arc, side="right") - 1, 0, len(node_arc) - 2)
-        step = (node_arc[1:] - node_arc[:-1])[index]
-        u = (arc - node_arc[index]) / step
         tangent = np.stack([np.cos(heading), np.sin(heading)], axis=1)
-        scale = (step * stretch[index])[:, None]
-        u = u[:, None]
-        curve = (
-            (1 + 2 * u) * (1 - u) ** 2 * nodes[index]
-            + u * (1 - u) ** 2 * scale * tangent[index]
-            + u**2 * (3 - 2 * u) * nodes[index + 1]
-            + u**2 * (u - 1) * scale * tangent[index + 1]
+        lengths = np.linalg.norm(np.diff(nodes, axis=0), axis=1)[:, None]
+        middle = 0.5 * (nodes[1:] + nodes[:-1]) - lengths / 8 * np.diff(tangent, axis=0)
+        between = np.arange(1, len(nodes))
+        return TwinShape(
+            np.insert(arc, between, 0.5 * (arc[1:] + arc[:-1])),
+            np.insert(nodes, between, middle, axis=0),
+            np.insert(heading, between, 0.5 * (heading[1:] + heading[:-1])),
         )
-        return TwinShape(arc, curve, np.interp(arc, node_arc, heading))
 
     def _target(self, chamber_pressure: Array, duration: float) -> dict[str, Array]:
         """Return what the material shall be under these pressures, by the fields of `Ramp`."""
@@ -240,7 +222,7 @@ class LimbTwin:
                 self._wander_noise.standard_normal()
             )
             left, right = gauge[2 * index], gauge[2 * index + 1]
-            here = self._vertex_segment == index
+            here = self._body.vertex_segment == index
             target["active"][here] = self.gain * (
                 segment.chamber_gain[0] * left
                 - segment.chamber_gain[1] * right
@@ -250,7 +232,7 @@ class LimbTwin:
                 1.0 + segment.pressure_stiffening * (left + right)
             )
             target["rest"][here] = segment.rest_curvature + self._wander[index]
-            target["rest_stretch"][self._element_segment == index] = segment.elongation * (
+            target["rest_stretch"][self._body.element_segment == index] = segment.elongation * (
                 left + right
             )
         return target
@@ -265,7 +247,9 @@ class LimbTwin:
     def _settle(self) -> None:
         steps = int(2.0 / TIME_STEP)
         ramp = self._ramp(self._target(self._pressure, 0.0), steps // 4)
-        advance(self._arrays, self._material, ramp, self._pegs, steps, TIME_STEP, _SETTLING_DRAG)
+        advance(
+            self._body.arrays, self._material, ramp, self._pegs, steps, TIME_STEP, _SETTLING_DRAG
+        )
         self._stop()
 
     def _settle_under_loads(self) -> None:
@@ -282,7 +266,7 @@ class LimbTwin:
         ramp = self._ramp(self._target(self._pressure, 0.0), 0)
         steps = round(0.5 / TIME_STEP)
         for _ in range(round(_LONGEST_SETTLING / (steps * TIME_STEP))):
-            advance(self._arrays, calm, ramp, self._pegs, steps, TIME_STEP, _SETTLING_DRAG)
+            advance(self._body.arrays, calm, ramp, self._pegs, steps, TIME_STEP, _SETTLING_DRAG)
             if np.abs(self._rod.velocity_collection).max() < _SETTLED_SPEED:
                 break
         self._stop()
@@ -302,7 +286,7 @@ class LimbTwin:
     def _node_headings(self) -> Array:
         element = self._element_headings()
         # Between a stiff and a flexible element the bend belongs to the flexible half.
-        flexible = np.where(self._element_segment >= 0, self._rod.rest_lengths, 0.0)
+        flexible = np.where(self._body.element_segment >= 0, self._rod.rest_lengths, 0.0)
         weight = flexible[1:] / np.maximum(flexible[1:] + flexible[:-1], 1e-12)
         inner = element[:-1] + (1.0 - weight) * np.diff(element)
         return np.concatenate([element[:1], inner, element[-1:]])

@@ -100,10 +100,6 @@ def moments(v: Array, rate: float, space: PlanarSpace, rod: PlanarRod) -> None:
     edge, turn, torque = space.edge, space.turn, space.torque
     bend, rest_kappa, cubic, viscous = rod.bend, rod.rest_kappa, rod.cubic, rod.viscous
     n = turn.shape[0]
-    torque[0, 0] = 0.0
-    torque[0, 1] = 0.0
-    torque[n - 1, 0] = 0.0
-    torque[n - 1, 1] = 0.0
     for i in range(1, n - 1):
         kappa = turn[i]
         slope = 1.0 + 0.25 * kappa * kappa
@@ -250,16 +246,9 @@ def unsymmetric(v: Array, rate: float, u: Array, space: PlanarSpace, rod: Planar
     Missing in `assemble` are −(Λu/|e|) n̂ tᵀ of a couple that keeps its force while its edge
     stretches, and c κ'² ∇θ (∇²θ v)ᵀ of the viscous moment, c = EI τ/l.
     """
-    add_couples(u, space, rod)
-    add_viscous(v, rate, space, rod)
-
-
-@inlined_kernel
-def add_couples(u: Array, space: PlanarSpace, rod: PlanarRod) -> None:
-    """Add −(Λu/|e|) n̂ tᵀ of each segment's two couples to space.a."""
-    first, last, gain = rod.first, rod.last, rod.gain
-    a, edge = space.a, space.edge
-    for m in range(gain.shape[0]):
+    first, last, gain, viscous = rod.first, rod.last, rod.gain, rod.viscous
+    a, drag, edge, turn = space.a, space.drag, space.edge, space.turn
+    for m in range(gain.shape[0]):  # the couples
         for end in range(2):
             j = first[m] if end == 0 else last[m]
             force = (-gain[m] if end == 0 else gain[m]) * u[m] * edge[j, 2]
@@ -269,16 +258,9 @@ def add_couples(u: Array, space: PlanarSpace, rod: PlanarRod) -> None:
                 for column in range(4):
                     along = (tx if column % 2 == 0 else ty) * (-1.0 if column < 2 else 1.0)
                     a[2 * j + row, 5 + column - row] -= force * normal * along
-
-
-@inlined_kernel
-def add_viscous(v: Array, rate: float, space: PlanarSpace, rod: PlanarRod) -> None:
-    """Add c κ'² ∇θ (∇²θ v)ᵀ to space.a; fill space.drag with c κ'² ∇θ ∇θᵀ times rate."""
-    viscous = rod.viscous
-    a, drag, edge, turn = space.a, space.drag, space.edge, space.turn
     gradient, change = space.parts[0], space.parts[1]
     drag[:] = 0.0
-    for i in range(1, turn.shape[0] - 1):
+    for i in range(1, turn.shape[0] - 1):  # the viscous moments
         if viscous[i] == 0.0:
             continue
         slope = 1.0 + 0.25 * turn[i] * turn[i]
