@@ -38,7 +38,7 @@ def experiment(tmp_path_factory) -> Path:
 
 def test_evaluate_an_experiment_and_a_bag_that_is_none(run, experiment: Path, tmp_path: Path):
     missing = tmp_path / "missing"
-    code, said, complaint = run(evaluate, experiment, missing, "--report", tmp_path)
+    code, said, complaint = run(evaluate, experiment, missing, "--results", tmp_path)
     assert code == 1
     assert f"error: no bag at {missing}" in complaint
     assert "0.60 cm less error" in said

@@ -32,6 +32,7 @@ from der_planner.results import (
     format_table,
     summarise,
     write_report,
+    write_results,
 )
 from der_planner.results.overlay import write_video
 
@@ -47,6 +48,7 @@ def _arguments() -> argparse.Namespace:
         metavar="DIR",
         help="write report.html, results.json, table.{md,csv,tex} and the figures (PDF, PNG)",
     )
+    parser.add_argument("--results", type=Path, metavar="DIR", help="write results.json only")
     parser.add_argument(
         "--video",
         type=Path,
@@ -82,8 +84,9 @@ def main() -> int:
 
 
 def _evaluate(given: argparse.Namespace) -> int:
-    if given.report is not None:
-        check_folder(given.report, "--report")
+    for name in ("report", "results"):
+        if getattr(given, name) is not None:
+            check_folder(getattr(given, name), f"--{name}")
     if given.video is not None:
         check_file(given.video, "--video")
     progress, bags, found = Progress(), expand(given.bags), []
@@ -97,6 +100,8 @@ def _evaluate(given: argparse.Namespace) -> int:
     if not results:
         return 1
     print(format_table(summarise(results), compare(results)))
+    if given.results is not None:
+        print(write_results(results, given.results))
     if given.report is not None:
         print(write_report(runs, results, given.report, progress=progress.say))
     if given.video is not None:
