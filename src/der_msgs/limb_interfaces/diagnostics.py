@@ -22,6 +22,8 @@ ENDED_IN_ORDER = "ended in order"
 """What a node says last, unless something ended it: its silence is then no alarm."""
 TOUCHED = "something touched the limb"
 """How the planner begins to say why a plan has ended, where it had the limb vented for that."""
+PRESSED = 1.0 / 24.0
+"""A limb counts as under pressure from this share of the driver's limit on."""
 
 
 @dataclass

@@ -46,7 +46,8 @@ _NOISE = (2e-3, 3e-4)
 _FIRST = (0.03, 0.03, 0.025, 0.15, 3e-3)
 """Deviation of δθ [rad], δθ̇ [rad/s], d, g and b [m] before the first measurement.
 
-Pressures here are shares of the limb's pressure limit."""
+Pressures here are shares of the limb's pressure limit.
+"""
 _PRESSURE_DENSITY = 6.25e-4
 """Density of the effective pressure that is white noise [√s]."""
 MISSING_DENSITY = 0.0104
@@ -99,6 +100,7 @@ class Estimator:
         self.nominal, self.chambers = nominal, chambers
         self._kept = round(history / STEP)
         self.inputs = nominal.model.inputs
+        self._limit = nominal.model.air.pneumatics.pressure_limit
         self.innovations: list[tuple[float, float, int]] = []
         self.newest = -math.inf
         self._measurements: dict[int, list[_Measurement]] = {}
@@ -243,7 +245,7 @@ class Estimator:
 
     def _deviations(self, parts: tuple[float, ...]) -> Array:
         """Return the deviations (4M + 2,) of the state from those of its parts, d in Pa."""
-        units = [1.0, 1.0, self.nominal.model.air.pneumatics.pressure_limit, 1.0, 1.0]
+        units = [1.0, 1.0, self._limit, 1.0, 1.0]
         return np.repeat(np.multiply(parts, units), [*[self.inputs] * 4, 2])
 
     def _forget(self, j: int) -> None:
@@ -316,14 +318,13 @@ class Estimator:
         """
         nominal, inputs = self.nominal, self.inputs
         size, swing = 4 * inputs + 2, 2 * inputs
-        limit = nominal.model.air.pneumatics.pressure_limit
         moves = np.tile(np.eye(size), (nominal.count, 1, 1))
         moves[:, :swing, :swing] = nominal.fine_transition
         moves[:, :swing, swing : swing + inputs] = nominal.fine_input
         moves[:, -2:, -2:] *= math.exp(-STEP / _TIP_TIME)
         wander = self._deviations((0.0, 0.0, missing_density, _GAIN_DENSITY, _TIP_DENSITY))
         noises = np.tile(np.diag(wander**2 * STEP), (nominal.count, 1, 1))
-        push = limit * _PRESSURE_DENSITY * nominal.fine_input
+        push = self._limit * _PRESSURE_DENSITY * nominal.fine_input
         noises[:, :swing, :swing] += push @ np.swapaxes(push, 1, 2) / STEP
         return moves, noises
 

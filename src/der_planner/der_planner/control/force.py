@@ -110,8 +110,9 @@ def locate(model: RodModel, lacking: Lacking, places: Array) -> Touch:
     limb = model.limb
     gain = max(segment.moment_gain for segment in limb.segments)
     usual = gain * limb.pneumatics.pressure_limit / limb.length
-    across = pull[:, 1] / (square[:, 1, 1] + (_LARGEST_FORCE * usual) ** -2)
-    expected = np.full_like(pull, _LARGEST_FORCE * usual)
+    largest = _LARGEST_FORCE * usual
+    across = pull[:, 1] / (square[:, 1, 1] + largest**-2)
+    expected = np.full_like(pull, largest)
     expected[:, 0] = _LEAST_ALONG * usual + _RUBS * np.abs(across)
     told = square + (expected**-2.0)[:, :, None] * np.eye(2)
     forces = np.linalg.solve(told, pull[..., None])[..., 0]

@@ -32,7 +32,8 @@ from der_planner.experiment.processes import (
 )
 from limb_interfaces import qos, topics
 from limb_interfaces.clocks import CLOCK_OFF, LARGEST, Offset
-from limb_interfaces.diagnostics import DiagnosticsPublisher, Health, message_version
+from limb_interfaces.diagnostics import PRESSED, DiagnosticsPublisher, Health, message_version
+from pressure_driver.protocols import USUAL_LIMIT
 
 DISCOVERY = 1.0
 """The orchestrator listens for another graph this long [s] before it starts nodes."""
@@ -46,8 +47,6 @@ STARTED = 2.0
 """The recorder has told this long [s] after the first setpoint that it records."""
 PORT_VENTS = 3.0
 """The process of a dead driver's port has vented the limb after this time [s]."""
-VENTED = 1.0 / 24.0
-"""A limb counts as vented below this share of the driver's limit."""
 EXPERIMENT = "experiment"
 """Name of the node that says what the experiment does."""
 
@@ -272,8 +271,9 @@ class RunningGraph:
         def vented() -> bool:
             state = self.client.newest.get(topics.PRESSURE_STATE)
             measured = state.measured_differential if state is not None else []
-            told = self.client.diagnostic_values("pressure_driver").get("pressure_limit_pa", 24e3)
-            return bool(measured) and all(abs(value) < VENTED * float(told) for value in measured)
+            told = self.client.diagnostic_values("pressure_driver")
+            most = PRESSED * float(told.get("pressure_limit_pa", USUAL_LIMIT))
+            return bool(measured) and all(abs(value) < most for value in measured)
 
         self.client.wait_for(vented, 30.0, "the chambers to vent")
 

@@ -72,8 +72,8 @@ class FreeTerms:
             and (segment == 0 or not term.shared)
             and 0 <= segment + term.neighbour < limb.segment_count
         )
-        limit = limb.pneumatics.pressure_limit
-        terms = tuple(TERMS[index].at_limit(limit) for _, index in places)
+        of_limb = terms_of(limb)
+        terms = tuple(of_limb[index] for _, index in places)
         return cls(limb, values_of(limb) if values is None else values, places, terms)
 
     @property
@@ -117,6 +117,11 @@ class FreeTerms:
         return to_limb(self.limb, values)
 
 
+def terms_of(limb: Limb) -> tuple[Term, ...]:
+    """Return `TERMS` for a limb of this pressure limit."""
+    return tuple(term.at_limit(limb.pneumatics.pressure_limit) for term in TERMS)
+
+
 def values_of(limb: Limb, *, starts: bool = False) -> Array:
     """Return the (M, T) values of a limb.
 
@@ -124,7 +129,7 @@ def values_of(limb: Limb, *, starts: bool = False) -> Array:
         limb: to describe.
         starts: put plausible friction and creep where it has none, for a search to begin at.
     """
-    terms = [term.at_limit(limb.pneumatics.pressure_limit) for term in TERMS]
+    terms = terms_of(limb)
     return np.array(
         [[_value(segment, term, starts) for term in terms] for segment in limb.segments]
     )

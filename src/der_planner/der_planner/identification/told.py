@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from der_planner.arrays import Array
 from der_planner.identification.bends import BendFit
 from der_planner.identification.report import Unknown, readable
-from der_planner.identification.terms import TERMS, FreeTerms
+from der_planner.identification.terms import FreeTerms, terms_of
 from der_planner.limb import Term
 
 Mask = NDArray[np.bool_]
@@ -125,14 +125,14 @@ def told(problem: BendFit, values: Array) -> tuple[tuple[Unknown, ...], Array]:
     correlation = covariance / np.outer(deviation, deviation)
     stiff = [term.name == "log_stiffness" for term in free.terms]
     deviation[stiff] = np.maximum(deviation[stiff], STIFFNESS_ERROR)
-    at_bound, limit = free.unknowns.at_bound(values), free.limb.pneumatics.pressure_limit
+    at_bound, before = free.unknowns.at_bound(values), terms_of(free.limb)
     unknowns = tuple(
         Unknown(
             name=_name(term, segment),
             unit=term.unit,
             value=float(value),
             deviation=float(sigma),
-            untold=bool(sigma > UNTOLD * TERMS[place].at_limit(limit).spread),
+            untold=bool(sigma > UNTOLD * before[place].spread),
             at_bound=bool(edge),
         )
         for term, (segment, place), value, sigma, edge in zip(

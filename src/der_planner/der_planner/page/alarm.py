@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
-from limb_interfaces.diagnostics import TOUCHED
+from limb_interfaces.diagnostics import PRESSED, TOUCHED
 
 SUPPLY = "close the valve at the air supply"
 """What is left where no program can vent the limb."""
-PRESSED = 1.0 / 24.0
-"""A limb counts as under pressure from this share of the driver's limit on."""
+WITHOUT_PRESSURE = "without pressure"
+"""What a limb is whose chambers are all known to be vented."""
 BOARD_SILENT = 0.5
 """A valve board counts as silent after this time [s] without telemetry."""
 LATE = 1.6
@@ -83,7 +83,7 @@ def describe_limb(driver: dict[str, Any] | None) -> str:
     largest = max(known, default=0.0)
     if largest > PRESSED * driver["limit_kpa"]:
         return f"under pressure ({largest:.1f} kPa)"
-    return "of unknown pressure" if not measured or None in measured else "without pressure"
+    return "of unknown pressure" if not measured or None in measured else WITHOUT_PRESSURE
 
 
 def board_answers(driver: dict[str, Any] | None) -> bool:

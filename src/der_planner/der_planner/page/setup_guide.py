@@ -10,9 +10,10 @@ from typing import Any
 
 from nicegui import Client, ui
 
-from der_planner.page.alarm import PRESSED, board_answers, describe_limb
+from der_planner.page.alarm import WITHOUT_PRESSURE, board_answers, describe_limb
 from der_planner.page.commands import FILLING, Answer
 from der_planner.page.server import STATIC, Parts
+from limb_interfaces.diagnostics import PRESSED
 
 ADDRESS = "/setup"
 RECONNECT = 60.0
@@ -178,7 +179,7 @@ def _zero_pressure(driver: dict[str, Any] | None) -> Step:
     measured: Sequence[float | None] = [] if driver is None else driver["measured_kpa"]
     known = [abs(value) for value in measured if value is not None]
     vented = driver is not None and driver["mode"] == "disarmed"
-    zero = describe_limb(driver) == "without pressure"
+    zero = describe_limb(driver) == WITHOUT_PRESSURE
     seen = f"largest differential pressure {max(known):.2f} kPa" if known else "nothing measured"
     if driver is not None and not vented:
         seen += f", the driver is {driver['mode']}"

@@ -22,6 +22,7 @@ from der_planner.limb import mounting_of
 from der_planner.page.alarm import LATE, NODES, alarms, describe_limb, missing, worst_first
 from limb_interfaces.diagnostics import ENDED_IN_ORDER
 from limb_interfaces.stamps import NANOSECONDS, nanoseconds
+from pressure_driver.protocols import USUAL_LIMIT
 
 PASCAL_PER_KILOPASCAL = 1000.0
 CENTIMETRES = 100.0
@@ -228,7 +229,7 @@ class Situation:
     @property
     def limit(self) -> float:
         """The driver's largest differential pressure [Pa]; its default before it has said so."""
-        return float(self.value_of("pressure_driver", "pressure_limit_pa") or 24e3)
+        return float(self.value_of("pressure_driver", "pressure_limit_pa") or USUAL_LIMIT)
 
     def snapshot(self) -> dict[str, Any]:
         """Return everything as JSON can carry it: kPa, cm and degrees, None where unknown."""
