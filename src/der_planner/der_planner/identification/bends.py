@@ -80,9 +80,7 @@ def follow(model: Model, log: Prepared, *, linearise: bool = False) -> Response:
     """
     time = log.log.time
     bend = _rubs_along(model.material.resting_bend(time, log.pressure), log)
-    return simulate(
-        model, time, pressures=log.pressure, bend=lambda _: bend, steps=1, linearise=linearise
-    )
+    return simulate(model, time, pressures=log.pressure, bend=lambda _: bend, linearise=linearise)
 
 
 class Predicted:
@@ -109,7 +107,6 @@ class Predicted:
         self._nudged = [free.limb_with(values + step) for step in steps]
         self._driven = [not self._changed(nudged) & _OF_THE_BODY for nudged in self._nudged]
         self._model = model.another(self._limb)
-        # The tangent of the arcs takes longer than all their differences: only where it is needed.
         self._response = follow(self._model, log, linearise=any(self._driven))
         self.angles, self.tip = self._response.bend_angles, self._response.tip
 

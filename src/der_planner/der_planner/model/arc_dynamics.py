@@ -22,10 +22,20 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from der_planner.model.arc_kernel import arc_point, factorise, substitute
+from der_planner.model.arc_kernel import arc_point
 
 Vector = NDArray[np.float64]
 Complex = NDArray[np.complex128]
+
+_STAGES = np.array([[5.0 / 12.0, -1.0 / 12.0], [0.75, 0.25]])
+"""The Radau IIA method: shares of both stages' slopes in what a stage holds; the second one is the
+end of the step."""
+_AT, _BY = _STAGES.sum(axis=1), _STAGES @ _STAGES
+"""Instants of the stages, and shares of their accelerations in a stage's angle."""
+_NEWTON_STEPS = 30
+"""Most iterations of a step."""
+_TOLERANCE, _LARGEST_MOVE = 1e-6, 1e3
+"""Changes of an angle in an iteration with which it is found, and given up [rad]."""
 
 
 class Arcs(NamedTuple):
@@ -109,59 +119,42 @@ def arc_slopes(q: Vector, arcs: Arcs, frame: Complex, order: int) -> Complex:
 
 
 @njit(cache=True, nogil=True, inline="always")
-def inertia_and_force(q: Vector, v: Vector, torque: Vector, arcs: Arcs) -> tuple[Vector, Vector]:
-    """Return M (n, n), its lower half, and torque + gravity's torque − (C + D) q̇ − K(q) (n,).
+def needed_torque(q: Vector, v: Vector, a: Vector, arcs: Arcs) -> Vector:
+    """Return R = M q̈ + (C + D) q̇ + K(q) − gravity's torque (n,).
 
-    The forces are summed particle by particle: m (g − Σ_kl H_kl q̇_k q̇_l) less the drag on its
-    velocity, by the particle's J. C and D, of which only the products with q̇ count, are not formed.
+    It is summed particle by particle: m (Σ_i J_i q̈_i + Σ_kl H_kl q̇_k q̇_l − g) and the drag on its
+    velocity, by the particle's J. M, C and D, of which only the products count, are not formed.
     """
     n = q.size
-    M = np.zeros((n, n))
     J, H = np.zeros(n, dtype=np.complex128), np.zeros((n, n), dtype=np.complex128)
     pull = complex(arcs.gravity[0], arcs.gravity[1])
     frame = joints(q, arcs)
     slopes = arc_slopes(q, arcs, frame, 2)
-    force = np.empty(n)
+    needed = np.empty(n)
     for i in range(n):
         bend = q[i] - arcs.rest[i]
-        force[i] = torque[i] - arcs.stiffness[i] * (bend + arcs.viscous[i] * v[i])
-        force[i] -= arcs.cubic[i] * bend**3
+        needed[i] = arcs.stiffness[i] * (bend + arcs.viscous[i] * v[i]) + arcs.cubic[i] * bend**3
     for p in range(arcs.owner.size):
-        mass, last = arcs.mass[p], arcs.owner[p] + 1
+        last = arcs.owner[p] + 1
         point_derivatives(q, arcs, frame, p, slopes, J, H)
-        velocity, turning = 0.0 + 0.0j, 0.0 + 0.0j
+        velocity, acceleration = 0.0 + 0.0j, 0.0 + 0.0j
         for i in range(last):
             velocity += J[i] * v[i]
-            turning += H[i, i] * v[i] * v[i]
+            acceleration += J[i] * a[i] + H[i, i] * v[i] * v[i]
             for k in range(i):
-                turning += 2.0 * H[i, k] * v[i] * v[k]
-        felt = arcs.weight[p] * pull - mass * turning - arcs.drag[p] * velocity
+                acceleration += 2.0 * H[i, k] * v[i] * v[k]
+        felt = arcs.mass[p] * acceleration - arcs.weight[p] * pull + arcs.drag[p] * velocity
         for i in range(last):
-            force[i] += J[i].real * felt.real + J[i].imag * felt.imag
-            for k in range(i + 1):
-                M[i, k] += mass * (J[i].real * J[k].real + J[i].imag * J[k].imag)
-    return M, force
-
-
-@njit(cache=True, nogil=True, inline="always")
-def acceleration(q: Vector, v: Vector, torque: Vector, arcs: Arcs) -> Any:
-    """Return q̈ (n,) from M q̈ + C q̇ + D q̇ + K(q) = torque + gravity's torque."""
-    M, force = inertia_and_force(q, v, torque, arcs)
-    factorise(M)
-    substitute(M, force)
-    return force
+            needed[i] += J[i].real * felt.real + J[i].imag * felt.imag
+    return needed
 
 
 @njit(cache=True, nogil=True)
-def needed_torque(q: Vector, v: Vector, a: Vector, arcs: Arcs) -> Vector:
-    """Return M q̈ + C q̇ + D q̇ + K(q) − gravity's torque (K, n) at angles, rates, accelerations."""
+def needed_torques(q: Vector, v: Vector, a: Vector, arcs: Arcs) -> Vector:
+    """Return `needed_torque` (K, n) at K angles, rates and accelerations."""
     result = np.empty_like(q)
     for k in range(len(q)):
-        M, force = inertia_and_force(q[k], v[k], np.zeros(q.shape[1]), arcs)
-        for i in range(q.shape[1]):
-            result[k, i] = -force[i]
-            for j in range(q.shape[1]):
-                result[k, i] += M[max(i, j), min(i, j)] * a[k, j]
+        result[k] = needed_torque(q[k], v[k], a[k], arcs)
     return result
 
 
@@ -245,59 +238,58 @@ def force_slopes(q: Vector, v: Vector, a: Vector, arcs: Arcs) -> tuple[Vector, V
 
 @njit(cache=True, nogil=True)
 def simulate(
-    q: Vector, v: Vector, pressures: Vector, step: float, parts: int, arcs: Arcs, linearise: bool
+    q: Vector, v: Vector, pressures: Vector, h: float, arcs: Arcs, linearise: bool
 ) -> tuple[Vector, Vector, Vector, Vector]:
-    """Roll the model forward with the classical Runge-Kutta method.
+    """Roll the model forward with the Radau IIA method of two stages, of order 3.
 
-    pressures (K, S, n) [Pa] are constant over each of the S steps of an interval; each step [s] is
-    taken in so many parts. Returns angles and rates (K + 1, n) at the interval boundaries.
+    It is stable whatever the step h [s], also where material damping is large, and lets motion die
+    down that is too fast for the step (Hairer and Wanner, Solving Ordinary Differential Equations
+    II, IV.5). The accelerations of both stages are found by Newton's method.
+
+    pressures (K, S, n) [Pa] are constant over each of the S steps of an interval. Returns angles
+    and rates (K + 1, n) at the interval boundaries, NaN from where a step was not found.
 
     To linearise each step, also A (K, S, 2n, 2n) and B (K, S, 2n, n): x′ = A x + B u for changes of
     x = (q, v) and of the step's pressures u; else these are empty.
     """
     count, substeps, n = pressures.shape
-    angles, rates = np.zeros((count + 1, n)), np.zeros((count + 1, n))
-    kept, columns = (count, 3 * n) if linearise else (0, 0)
+    angles, rates = np.full((count + 1, n), np.nan), np.full((count + 1, n), np.nan)
+    kept = count if linearise else 0
     A = np.zeros((kept, substeps, 2 * n, 2 * n))
     B = np.zeros((kept, substeps, 2 * n, n))
     angles[0], rates[0] = q, v
-    h = step / parts
-    right = np.empty(n)
+    a = np.zeros((2, n))
+    matrix, left, columns = np.empty((2 * n, 2 * n)), np.empty(2 * n), np.zeros((2 * n, 3 * n))
     for k in range(count):
         for s in range(substeps):
             torque = arcs.gain * pressures[k, s]
-            # Columns: changes by q and v before the step, and by its pressures.
-            dx = np.eye(2 * n, columns)
-            for _ in range(parts):
-                q_stage, v_stage, d_stage = q, v, dx
-                q_total, v_total = np.zeros(n), np.zeros(n)
-                d_total = np.zeros((2 * n, columns))
-                for stage in range(4):
-                    slope = acceleration(q_stage, v_stage, torque, arcs)
-                    share = 2.0 if stage in (1, 2) else 1.0
-                    ahead = h if stage == 2 else 0.5 * h
-                    if linearise:
-                        by_angle, by_rate, M = force_slopes(q_stage, v_stage, slope, arcs)
-                        factorise(M)
-                        d_slope = np.empty((2 * n, columns))
-                        for c in range(columns):
-                            for i in range(n):
-                                right[i] = arcs.gain[i] if c == 2 * n + i else 0.0
-                                for j in range(n):
-                                    right[i] -= by_angle[i, j] * d_stage[j, c]
-                                    right[i] -= by_rate[i, j] * d_stage[n + j, c]
-                            substitute(M, right)
-                            d_slope[:n, c] = d_stage[n:, c]
-                            d_slope[n:, c] = right
-                        d_total += share * d_slope
-                        d_stage = dx + ahead * d_slope
-                    q_total += share * v_stage
-                    v_total += share * slope
-                    q_stage, v_stage = q + ahead * v_stage, v + ahead * slope
-                q = q + h / 6.0 * q_total
-                v = v + h / 6.0 * v_total
-                dx = dx + h / 6.0 * d_total
+            for _ in range(_NEWTON_STEPS):
+                for i in range(2):
+                    q_i = q + h * _AT[i] * v + h**2 * (_BY[i, 0] * a[0] + _BY[i, 1] * a[1])
+                    v_i = v + h * (_STAGES[i, 0] * a[0] + _STAGES[i, 1] * a[1])
+                    by_angle, by_rate, M = force_slopes(q_i, v_i, a[i], arcs)
+                    rows = slice(i * n, (i + 1) * n)
+                    left[rows] = torque - needed_torque(q_i, v_i, a[i], arcs)
+                    for j in range(2):
+                        block = h**2 * _BY[i, j] * by_angle + h * _STAGES[i, j] * by_rate
+                        matrix[rows, j * n : (j + 1) * n] = block + M if i == j else block
+                    columns[rows, :n] = -by_angle
+                    columns[rows, n : 2 * n] = -by_rate - h * _AT[i] * by_angle
+                    columns[rows, 2 * n :] = np.diag(arcs.gain)
+                change = np.linalg.solve(matrix, left)
+                a += change.reshape(2, n)
+                moved = h**2 * np.abs(change).max()
+                if not _TOLERANCE < moved < _LARGEST_MOVE:
+                    break
+            if not moved <= _TOLERANCE:
+                return angles, rates, A, B
+            q = q + h * v + h**2 * (_BY[1, 0] * a[0] + _BY[1, 1] * a[1])
+            v = v + h * (_STAGES[1, 0] * a[0] + _STAGES[1, 1] * a[1])
             if linearise:
+                by = np.linalg.solve(matrix, columns)
+                dx = np.eye(2 * n, 3 * n)
+                dx[:n] += h * dx[n:] + h**2 * (_BY[1, 0] * by[:n] + _BY[1, 1] * by[n:])
+                dx[n:] += h * (_STAGES[1, 0] * by[:n] + _STAGES[1, 1] * by[n:])
                 A[k, s], B[k, s] = dx[:, : 2 * n], dx[:, 2 * n :]
         angles[k + 1], rates[k + 1] = q, v
     return angles, rates, A, B

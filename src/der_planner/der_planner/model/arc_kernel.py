@@ -1,4 +1,4 @@
-"""Compiled functions of one arc, and of equations with the few unknowns of a limb.
+"""Compiled functions of one arc.
 
 The shape of an arc, g(z) = ∫₀¹ exp(i z η) dη, has the derivatives iᵏ ∫₀¹ ηᵏ exp(i z η) dη. All are
 smooth through z = 0, where the quotients that they can be written as lose their digits: there a
@@ -63,33 +63,3 @@ def arcs_and_slopes(z: Vector) -> Any:
         zeroth, first, _, _ = arc_moments(z[k])
         arcs[k], slopes[k] = zeroth, 1j * first
     return arcs, slopes
-
-
-@njit(cache=True, nogil=True, inline="always")
-def factorise(A: Vector) -> None:
-    """Replace the lower half of a positive definite A (n, n) by its Cholesky factor.
-
-    For the few unknowns of a limb, calling LAPACK would take longer than this.
-    """
-    for i in range(A.shape[0]):
-        for k in range(i + 1):
-            value = A[i, k]
-            for m in range(k):
-                value -= A[i, m] * A[k, m]
-            A[i, k] = np.sqrt(value) if i == k else value / A[k, k]
-
-
-@njit(cache=True, nogil=True, inline="always")
-def substitute(A: Vector, b: Vector) -> None:
-    """Replace b (n,) by the solution x of A x = b, with A as `factorise` left it."""
-    n = b.size
-    for i in range(n):
-        value = b[i]
-        for m in range(i):
-            value -= A[i, m] * b[m]
-        b[i] = value / A[i, i]
-    for i in range(n - 1, -1, -1):
-        value = b[i]
-        for m in range(i + 1, n):
-            value -= A[m, i] * b[m]
-        b[i] = value / A[i, i]

@@ -31,8 +31,6 @@ QUADRATURE_POINTS = 6
 """Gauss-Legendre points a segment: exact to 1e-11 for bends below 90 degrees, 1e-9 below 180."""
 _RESTING_STEPS = 60
 """Newton's steps to the pose at rest at the most."""
-_LARGEST_PHASE = 1.0
-"""Phase of the limb's fastest mode in one step of the integrator [rad]; unstable beyond 2.8."""
 
 
 @dataclass(frozen=True)
@@ -204,7 +202,7 @@ class ArcModel(Model):
         if not self.arcs.gravity.any() and not self.cubic.any():
             return ArcState(q, still)
         for _ in range(_RESTING_STEPS):
-            _, pull = kernels.inertia_and_force(q, still, drive, self.arcs)
+            pull = drive - kernels.needed_torque(q, still, still, self.arcs)
             values, vectors = np.linalg.eigh(self.stiffness_matrix(q))
             firm = np.maximum(np.abs(values), 1e-3 * self.stiffness.min())
             step = vectors @ ((vectors.T @ pull) / firm)
@@ -235,7 +233,7 @@ class ArcModel(Model):
             np.atleast_2d(np.ascontiguousarray(x, dtype=float))
             for x in (angles, rates, accelerations)
         )
-        pressures: Array = kernels.needed_torque(q, v, a, self.arcs) / self.gain
+        pressures: Array = kernels.needed_torques(q, v, a, self.arcs) / self.gain
         return pressures
 
     def static_pressure(self, bend_angles: ArrayLike) -> Array:
@@ -250,7 +248,7 @@ class ArcModel(Model):
     def run(
         self, start: State, effective: Array, period: float, linearise: Outputs = ""
     ) -> Rollout:
-        """Simulate the arcs by steps of Runge and Kutta, see `Model.run`.
+        """Simulate the arcs by steps of the Radau method, see `Model.run`; NaN where it fails.
 
         Raises:
             ValueError: wrong shapes.
@@ -262,7 +260,7 @@ class ArcModel(Model):
             raise ValueError(f"pressures must be (K, S, {self.segment_count}), got {inputs.shape}")
         step, linear = period / inputs.shape[1], None
         angles, rates, by_state, by_pressure = kernels.simulate(
-            start.angles, start.rates, inputs, step, self._parts(step), self.arcs, bool(linearise)
+            start.angles, start.rates, inputs, step, self.arcs, bool(linearise)
         )
         if linearise:
             linear = ArcFirstOrder(self.tip_jacobians(angles), by_state, by_pressure)
@@ -278,16 +276,6 @@ class ArcModel(Model):
         zero = np.zeros_like(q)
         matrix: Array = kernels.force_slopes(q, zero, zero, self.arcs)[0]
         return matrix
-
-    def _parts(self, step: float) -> int:
-        """Return in how many parts the integrator takes a step, by the fastest mode of the limb."""
-        zero = np.zeros(self.segment_count)
-        _, damping, M = kernels.force_slopes(zero, zero, zero, self.arcs)
-        drag = np.linalg.solve(M, damping)
-        stiff = np.linalg.solve(M, np.diag(self.stiffness))
-        rates = np.block([[0 * M, np.eye(len(M))], [-stiff, -drag]])
-        fastest = float(np.abs(np.linalg.eigvals(rates)).max())
-        return max(1, int(np.ceil(fastest * step / _LARGEST_PHASE)))
 
 
 def _arc_ends(angles: Array) -> tuple[Complex, Complex]:

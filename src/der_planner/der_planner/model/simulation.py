@@ -30,8 +30,6 @@ STEPS = 5
 """Integrator steps in a control period: 10 ms."""
 _LONGEST_PERIOD = 1.0
 """Of instants that are told in seconds [s]."""
-_ARC_STEP = 0.01
-"""Integrator step of the arcs under measured pressures [s]."""
 
 
 class Initial(NamedTuple):
@@ -139,8 +137,7 @@ def simulate(
         bend: bend angles of the motion along which friction and creep act; None: along the bend at
             rest under the pressures (`Material.resting_bend`).
         initial: what is there at ``time[0]``.
-        steps: S, integrator steps an interval; default 5 for commands, for pressures 1 (rod) or one
-            of 10 ms (arcs).
+        steps: S, integrator steps an interval; default 5 for commands, 1 for pressures.
         linearise: also give the derivative.
 
     Raises:
@@ -158,7 +155,7 @@ def simulate(
         boundaries = np.append(times, times[-1] + period)
         begin: State = model.rest if initial.state is None else initial.state
     else:
-        count = steps or (1 if model.name == "der" else max(1, round(period / _ARC_STEP)))
+        count = steps or 1
         felt = _from_pressures(model.material, times, given, count, bend)
         boundaries = times
         begin = model.resting(felt.first) if initial.state is None else initial.state
