@@ -32,10 +32,13 @@ _STAGES = np.array([[5.0 / 12.0, -1.0 / 12.0], [0.75, 0.25]])
 end of the step."""
 _AT, _BY = _STAGES.sum(axis=1), _STAGES @ _STAGES
 """Instants of the stages, and shares of their accelerations in a stage's angle."""
-_NEWTON_STEPS = 30
-"""Most iterations of a step."""
-_TOLERANCE, _LARGEST_MOVE = 1e-6, 1e3
-"""Changes of an angle in an iteration with which it is found, and given up [rad]."""
+_NEWTON_STEPS, _MOST_PARTS = 12, 1024
+"""Most iterations of a step, and most parts of one."""
+_TOLERANCE = 1e-5
+"""Relative change of the accelerations in the last iteration."""
+_FARTHEST = 0.3
+"""Change of an angle by its acceleration up to which a step is short enough [rad]: in longer ones
+Newton's method may find accelerations of another motion."""
 
 
 class Arcs(NamedTuple):
@@ -236,6 +239,48 @@ def force_slopes(q: Vector, v: Vector, a: Vector, arcs: Arcs) -> tuple[Vector, V
     return by_angle, by_rate, M
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _step(
+    q: Vector, v: Vector, torque: Vector, h: float, a: Vector, arcs: Arcs, linearise: bool
+) -> tuple[bool, Vector, Vector, Vector]:
+    """Take one step of the Radau IIA method, both stages together by Newton's method.
+
+    ``a`` (2, n) holds a guess of the stages' accelerations, and those that were found. Returns
+    whether they were, angles and rates after the step, and their derivatives (2n, 3n) by those
+    before it and by the pressures.
+    """
+    n = q.size
+    matrix, left, columns = np.empty((2 * n, 2 * n)), np.empty(2 * n), np.zeros((2 * n, 3 * n))
+    by = np.eye(2 * n, 3 * n)
+    for _ in range(_NEWTON_STEPS):
+        for i in range(2):
+            q_i = q + h * _AT[i] * v + h**2 * (_BY[i, 0] * a[0] + _BY[i, 1] * a[1])
+            v_i = v + h * (_STAGES[i, 0] * a[0] + _STAGES[i, 1] * a[1])
+            by_angle, by_rate, M = force_slopes(q_i, v_i, a[i], arcs)
+            rows = slice(i * n, (i + 1) * n)
+            left[rows] = torque - needed_torque(q_i, v_i, a[i], arcs)
+            for j in range(2):
+                block = h**2 * _BY[i, j] * by_angle + h * _STAGES[i, j] * by_rate
+                matrix[rows, j * n : (j + 1) * n] = block + M if i == j else block
+            if linearise:
+                columns[rows, :n] = -by_angle
+                columns[rows, n : 2 * n] = -by_rate - h * _AT[i] * by_angle
+                columns[rows, 2 * n :] = np.diag(arcs.gain)
+        change = np.linalg.solve(matrix, left)
+        a += change.reshape(2, n)
+        error = np.abs(change).max() / (1.0 + np.abs(a).max())
+        if not error > _TOLERANCE:
+            break
+    q = q + h * v + h**2 * (_BY[1, 0] * a[0] + _BY[1, 1] * a[1])
+    v = v + h * (_STAGES[1, 0] * a[0] + _STAGES[1, 1] * a[1])
+    if linearise:
+        pushed = np.linalg.solve(matrix, columns)
+        by[:n] += h * by[n:] + h**2 * (_BY[1, 0] * pushed[:n] + _BY[1, 1] * pushed[n:])
+        by[n:] += h * (_STAGES[1, 0] * pushed[:n] + _STAGES[1, 1] * pushed[n:])
+    found = error <= _TOLERANCE and h**2 * np.abs(a).max() <= _FARTHEST
+    return found, q, v, by
+
+
 @njit(cache=True, nogil=True)
 def simulate(
     q: Vector, v: Vector, pressures: Vector, h: float, arcs: Arcs, linearise: bool
@@ -244,7 +289,7 @@ def simulate(
 
     It is stable whatever the step h [s], also where material damping is large, and lets motion die
     down that is too fast for the step (Hairer and Wanner, Solving Ordinary Differential Equations
-    II, IV.5). The accelerations of both stages are found by Newton's method.
+    II, IV.5). A step in which Newton's method fails is taken in 2, 4, 8 … parts.
 
     pressures (K, S, n) [Pa] are constant over each of the S steps of an interval. Returns angles
     and rates (K + 1, n) at the interval boundaries, NaN from where a step was not found.
@@ -259,37 +304,25 @@ def simulate(
     B = np.zeros((kept, substeps, 2 * n, n))
     angles[0], rates[0] = q, v
     a = np.zeros((2, n))
-    matrix, left, columns = np.empty((2 * n, 2 * n)), np.empty(2 * n), np.zeros((2 * n, 3 * n))
     for k in range(count):
         for s in range(substeps):
-            torque = arcs.gain * pressures[k, s]
-            for _ in range(_NEWTON_STEPS):
-                for i in range(2):
-                    q_i = q + h * _AT[i] * v + h**2 * (_BY[i, 0] * a[0] + _BY[i, 1] * a[1])
-                    v_i = v + h * (_STAGES[i, 0] * a[0] + _STAGES[i, 1] * a[1])
-                    by_angle, by_rate, M = force_slopes(q_i, v_i, a[i], arcs)
-                    rows = slice(i * n, (i + 1) * n)
-                    left[rows] = torque - needed_torque(q_i, v_i, a[i], arcs)
-                    for j in range(2):
-                        block = h**2 * _BY[i, j] * by_angle + h * _STAGES[i, j] * by_rate
-                        matrix[rows, j * n : (j + 1) * n] = block + M if i == j else block
-                    columns[rows, :n] = -by_angle
-                    columns[rows, n : 2 * n] = -by_rate - h * _AT[i] * by_angle
-                    columns[rows, 2 * n :] = np.diag(arcs.gain)
-                change = np.linalg.solve(matrix, left)
-                a += change.reshape(2, n)
-                moved = h**2 * np.abs(change).max()
-                if not _TOLERANCE < moved < _LARGEST_MOVE:
-                    break
-            if not moved <= _TOLERANCE:
-                return angles, rates, A, B
-            q = q + h * v + h**2 * (_BY[1, 0] * a[0] + _BY[1, 1] * a[1])
-            v = v + h * (_STAGES[1, 0] * a[0] + _STAGES[1, 1] * a[1])
+            torque, parts, done = arcs.gain * pressures[k, s], 1, 0
+            while done < parts:
+                if done == 0:
+                    q_part, v_part, dx = q, v, np.eye(2 * n, 3 * n)
+                found, q_part, v_part, by = _step(
+                    q_part, v_part, torque, h / parts, a, arcs, linearise
+                )
+                dx = by[:, : 2 * n] @ dx
+                dx[:, 2 * n :] += by[:, 2 * n :]
+                done += 1
+                if not found:
+                    parts, done = 2 * parts, 0
+                    a[:] = 0.0
+                    if parts > _MOST_PARTS:
+                        return angles, rates, A, B
+            q, v = q_part, v_part
             if linearise:
-                by = np.linalg.solve(matrix, columns)
-                dx = np.eye(2 * n, 3 * n)
-                dx[:n] += h * dx[n:] + h**2 * (_BY[1, 0] * by[:n] + _BY[1, 1] * by[n:])
-                dx[n:] += h * (_STAGES[1, 0] * by[:n] + _STAGES[1, 1] * by[n:])
                 A[k, s], B[k, s] = dx[:, : 2 * n], dx[:, 2 * n :]
         angles[k + 1], rates[k + 1] = q, v
     return angles, rates, A, B
