@@ -23,7 +23,6 @@ from der_planner.experiment.console import Progress
 from der_planner.experiment.options import Options
 from der_planner.experiment.processes import (
     PAGE_TOKEN,
-    STOP_ORDER,
     GraphError,
     GraphSetup,
     NodeProcess,
@@ -295,10 +294,9 @@ class RunningGraph:
             )
 
     def stop(self) -> None:
-        """Stop every node."""
-        for name in STOP_ORDER:
-            if name in self.processes:
-                self.processes[name].stop()
+        """Stop every node, in the reverse of the order in which they were started."""
+        for process in reversed(self.processes.values()):
+            process.stop()
 
 
 # The page of an experiment --------------------------------------------------------------------

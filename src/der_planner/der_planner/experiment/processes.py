@@ -27,18 +27,6 @@ from der_planner.planning import Obstacles
 from pressure_driver.protocols import SettingError, order_of
 from pressure_driver.settings import Settings
 
-STOP_ORDER = (
-    "planner",
-    "apriltag_tracker",
-    "pose_tracker",
-    "synthetic_camera",
-    "synthetic_poses",
-    "limb_twin",
-    "recorder",
-    "pressure_driver",
-    "page",
-    "board_emulator",
-)
 MOVABLE = {"driver": "pressure_driver", "tracker": "apriltag_tracker", "poses": "pose_tracker"}
 """Nodes that may run on another computer, by their keys in a hardware file."""
 BOARD_PARAMETERS = {"pneudrive": {"sensor_range": 103_400.0}}
@@ -214,7 +202,11 @@ class GraphSetup:
         return str(self.rig.driver.get("protocol", self.board))
 
     def nodes(self, port: str) -> list[NodeSpec]:
-        """Return the nodes in the order in which they start; the emulated board is at ``port``."""
+        """Return the nodes in the order in which they start; they stop in the reverse one.
+
+        Args:
+            port: where the emulated board is.
+        """
         rig = self.rig
         language = {"protocol": self.protocol, **BOARD_PARAMETERS.get(self.protocol, {})}
         board = {"port_link": port, "seed": self.seed, **language}
@@ -229,7 +221,10 @@ class GraphSetup:
             **rig.recorder,
         }
         poses = rig.poses
-        specs = [NodeSpec("pressure_driver", "pressure_driver", driver)]
+        specs = [
+            NodeSpec("pressure_driver", "pressure_driver", driver),
+            NodeSpec("der_planner", "recorder", recorder),
+        ]
         if rig.twin is not None:
             specs.insert(0, NodeSpec("pressure_driver", "board_emulator", board))
             twin |= rig.twin
@@ -253,7 +248,6 @@ class GraphSetup:
         planner = {**(self.planner or {}), **rig.planner}
         if self.planner is not None:
             specs.append(NodeSpec("der_planner", "planner", planner))
-        specs.append(NodeSpec("der_planner", "recorder", recorder))
         if self.page is not None:
             # The page draws with the planner's limb on the tracker's tags.
             shared = (
