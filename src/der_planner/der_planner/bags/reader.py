@@ -122,18 +122,15 @@ class BagReader:
     def topics(self) -> dict[str, RecordedTopic]:
         """The bag's topics by name."""
         found: dict[str, RecordedTopic] = {}
-        for connection in self._reader.connections:
-            name, count = connection.topic, connection.msgcount
-            if name in found:
-                count += found[name].message_count
-            profiles = getattr(connection.ext, "offered_qos_profiles", [])
+        for name, topic in self._reader.topics.items():
+            profiles = [p for each in topic.connections for p in each.ext.offered_qos_profiles]
+            latched = all(p.durability.name == "TRANSIENT_LOCAL" for p in profiles)
             found[name] = RecordedTopic(
                 name,
-                connection.msgtype,
-                count,
+                topic.connections[-1].msgtype,
+                topic.msgcount,
                 reliable=all(p.reliability.name != "BEST_EFFORT" for p in profiles),
-                latched=bool(profiles)
-                and all(p.durability.name == "TRANSIENT_LOCAL" for p in profiles),
+                latched=bool(profiles) and latched,
             )
         return found
 
