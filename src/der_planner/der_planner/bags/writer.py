@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import contextlib
 import shutil
-from collections import Counter
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -36,10 +36,29 @@ REPEATS = 3
 """A topic's definition is repeated outside of chunks at so many flushes after its first message."""
 PROFILE = "ros2"
 LIBRARY = "der_planner recorder"
+_Message = tuple[int, bytes, int, int]
+"""Log time [ns], content, publish time [ns] and number, as `mcap.writer.Writer` takes them."""
 
 
 class BagWriteError(OSError):
     """The bag cannot be written any further; the message says why and what is left of it."""
+
+
+@dataclass
+class _Topic:
+    """What of a topic is in the bag.
+
+    Attributes:
+        spec: of the topic.
+        count: messages that were written.
+        channel: of the topic, from its first message in the file on.
+        repeats: at so many flushes to come its definition is repeated.
+    """
+
+    spec: TopicSpec
+    count: int = 0
+    channel: Channel | None = None
+    repeats: int = REPEATS
 
 
 class BagWriter:
@@ -66,18 +85,14 @@ class BagWriter:
     ) -> None:
         self.folder = Path(folder)
         self.custom_data = dict(custom_data or {})
-        self._compression = COMPRESSIONS[compression]
+        packed = COMPRESSIONS[compression]
         self._minimum_free = minimum_free
-        self._topics: dict[str, TopicSpec] = {}
-        self._counts: Counter[str] = Counter()
+        self._topics: dict[str, _Topic] = {}
         self._name = f"{self.folder.name}_0.mcap"
         self._first, self._last = 0, 0
-        self._small: list[tuple[TopicSpec, int, int, bytes]] = []
+        self._small: list[tuple[_Topic, _Message]] = []
         self._small_bytes = 0
-        self._sequences: dict[str, int] = {}
-        self._channels: dict[str, Channel] = {}
         self._schemas: dict[str, Schema] = {}
-        self._repeats: dict[str, int] = {}
         self.byte_count = 0
         """Bytes in the file; what waits for the next flush is not counted."""
         self._closed = False
@@ -87,7 +102,12 @@ class BagWriter:
                 raise BagWriteError(f"the bag folder {self.folder} is not empty: name another one")
             if self._lacks_space():
                 raise BagWriteError(f"{self._too_little()}: nothing is recorded")
-            self._open_file()
+            self._file = (self.folder / self._name).open("xb")
+            self._writer = Writer(self._file, chunk_size=CHUNK_SIZE, compression=packed)
+            self._writer.start(profile=PROFILE, library=LIBRARY)
+            if self.custom_data:
+                self._writer.add_metadata(RUN_KEY, self.custom_data)
+            self._file.flush()
         except BagWriteError:
             raise
         except OSError as error:
@@ -96,7 +116,7 @@ class BagWriter:
     @property
     def message_count(self) -> int:
         """Messages written."""
-        return self._counts.total()
+        return sum(topic.count for topic in list(self._topics.values()))
 
     def write(self, spec: TopicSpec, log_time: int, publish_time: int, data: bytes) -> None:
         """Append one message.
@@ -110,16 +130,17 @@ class BagWriter:
         Raises:
             BagWriteError: the storage refused; the bag stays as it is, without an index.
         """
-        spec = self._topics.setdefault(spec.name, spec)
-        self._first = min(self._first, log_time) if self._counts else log_time
+        self._first = min(self._first, log_time) if self._topics else log_time
         self._last = max(self._last, log_time)
-        self._counts[spec.name] += 1
+        topic = self._topics.setdefault(spec.name, _Topic(spec))
+        message = (log_time, data, publish_time, topic.count & 0xFFFFFFFF)
+        topic.count += 1
         with self._guarded():
             if len(data) >= LARGE:
-                self._emit(spec, log_time, publish_time, data)
+                self._emit(topic, message)
                 self._end_chunk()
                 return
-            self._small.append((spec, log_time, publish_time, data))
+            self._small.append((topic, message))
             self._small_bytes += len(data)
             if self._small_bytes >= CHUNK_SIZE:
                 self._emit_small()
@@ -162,14 +183,6 @@ class BagWriter:
             self._closed = True
         return self.folder
 
-    def _open_file(self) -> None:
-        self._file = (self.folder / self._name).open("xb")
-        self._writer = Writer(self._file, chunk_size=CHUNK_SIZE, compression=self._compression)
-        self._writer.start(profile=PROFILE, library=LIBRARY)
-        if self.custom_data:
-            self._writer.add_metadata(RUN_KEY, self.custom_data)
-        self._file.flush()
-
     def _emit_small(self) -> None:
         """Write the small messages that wait, as one chunk."""
         for message in self._small:
@@ -182,20 +195,11 @@ class BagWriter:
         self._writer.flush()
         self.byte_count = self._file.tell()
 
-    def _emit(self, spec: TopicSpec, log_time: int, publish_time: int, data: bytes) -> None:
-        if spec.name not in self._channels:
-            self._register(spec)
-        sequence = self._sequences.get(spec.name, 0)
-        self._sequences[spec.name] = sequence + 1
-        self._writer.add_message(
-            channel_id=self._channels[spec.name].id,
-            log_time=log_time,
-            publish_time=publish_time,
-            sequence=sequence & 0xFFFFFFFF,
-            data=data,
-        )
+    def _emit(self, topic: _Topic, message: _Message) -> None:
+        topic.channel = topic.channel or self._registered(topic.spec)
+        self._writer.add_message(topic.channel.id, *message)
 
-    def _register(self, spec: TopicSpec) -> None:
+    def _registered(self, spec: TopicSpec) -> Channel:
         if spec.type_name not in self._schemas:
             text = spec.definition.encode()
             number = self._writer.register_schema(spec.type_name, spec.encoding, text)
@@ -203,8 +207,7 @@ class BagWriter:
         about = {"offered_qos_profiles": spec.qos_yaml(), "topic_type_hash": spec.type_hash}
         schema = self._schemas[spec.type_name].id
         number = self._writer.register_channel(spec.name, "cdr", schema, about)
-        self._channels[spec.name] = Channel(number, spec.name, "cdr", about, schema)
-        self._repeats[spec.name] = REPEATS
+        return Channel(number, spec.name, "cdr", about, schema)
 
     def _repeat_definitions(self) -> None:
         """Write what is known of young topics again, outside of chunks.
@@ -213,12 +216,13 @@ class BagWriter:
         damaged, nobody could read the others.
         """
         records = RecordBuilder()
-        for name in self._repeats:
-            self._schemas[self._topics[name].type_name].write(records)
-            self._channels[name].write(records)
+        for topic in self._topics.values():
+            if topic.channel is not None and topic.repeats > 0:
+                self._schemas[topic.spec.type_name].write(records)
+                topic.channel.write(records)
+                topic.repeats -= 1
         self._file.write(records.end())
         self._end_chunk()
-        self._repeats = {name: left - 1 for name, left in self._repeats.items() if left > 1}
 
     @contextlib.contextmanager
     def _guarded(self) -> Iterator[None]:
@@ -264,15 +268,15 @@ class BagWriter:
             "topics_with_message_count": [
                 {
                     "topic_metadata": {
-                        "name": spec.name,
-                        "type": spec.type_name,
+                        "name": topic.spec.name,
+                        "type": topic.spec.type_name,
                         "serialization_format": "cdr",
-                        "offered_qos_profiles": [profile.as_mapping() for profile in spec.qos],
-                        "type_description_hash": spec.type_hash,
+                        "offered_qos_profiles": [each.as_mapping() for each in topic.spec.qos],
+                        "type_description_hash": topic.spec.type_hash,
                     },
-                    "message_count": self._counts[spec.name],
+                    "message_count": topic.count,
                 }
-                for spec in self._topics.values()
+                for topic in self._topics.values()
             ],
             "compression_format": "",
             "compression_mode": "",
