@@ -1,16 +1,26 @@
 """Feedback of the planner node: revisions in time, estimates, lost tags, and slow solutions."""
 
 import threading
+from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
+from visualization_msgs.msg import Marker
+
+from der_msgs.msg import LimbState
+from der_planner.control import Feedback
+from der_planner.control.force import untouched
+from der_planner.limb import Limb
+from der_planner.nodes.planner_feedback import Corrector, _Corrected
+from der_planner.nodes.planner_topics import PlannerPublishers
+from der_planner.planning import Motion, plan
+from der_planner.planning.streaming import Schedule
+from limb_interfaces import topics
+from limb_interfaces.stamps import nanoseconds, stamp_from_nanoseconds
 
 
 def test_pictures_from_the_future_are_left_out_and_named_once():
-    from der_msgs.msg import LimbState
-    from der_planner.nodes.planner_feedback import Corrector
-    from limb_interfaces.stamps import stamp_from_nanoseconds
-
     said = []
     now = 1_700_000_000_000_000_000
     corrector = Corrector(None, said.append, lambda: now, lambda _: None)
@@ -27,10 +37,6 @@ def test_pictures_from_the_future_are_left_out_and_named_once():
 
 
 def test_a_plan_from_rest_begins_with_what_the_one_before_has_told():
-    from unittest.mock import Mock
-
-    from der_planner.nodes.planner_feedback import Corrector
-
     corrector = Corrector(Mock(), Mock(), lambda: 0, Mock())
     first, second = Mock(), Mock()
     for feedback in (first, second):
@@ -46,10 +52,6 @@ def test_a_plan_from_rest_begins_with_what_the_one_before_has_told():
 
 
 def test_a_reaction_holds_however_late_corrections_are():
-    from unittest.mock import Mock
-
-    from der_planner.nodes.planner_feedback import _Corrected
-
     held, schedule = np.array([9e3, 7e3]), Mock()
     schedule.plan.differential_pressure = np.full((100, 2), 13e3)
     schedule.plan.limb.pneumatics.pressure_limit = 24e3
@@ -61,12 +63,6 @@ def test_a_reaction_holds_however_late_corrections_are():
 
 
 def test_the_end_of_a_motion_ends_its_touch_and_says_why_it_vented():
-    from dataclasses import replace
-    from unittest.mock import Mock
-
-    from der_planner.control.force import untouched
-    from der_planner.nodes.planner_feedback import Corrector
-
     output, schedule, feedback = Mock(), Mock(), Mock()
     feedback.touch = replace(untouched(3.0, np.zeros(2)), touched=True, said="0.21 N")
     corrector = Corrector(output, Mock(), lambda: 0, Mock())
@@ -83,19 +79,6 @@ def test_the_end_of_a_motion_ends_its_touch_and_says_why_it_vented():
 
 
 def test_a_touch_is_published_and_drawn_while_it_lasts():
-    from dataclasses import replace
-    from unittest.mock import Mock
-
-    from visualization_msgs.msg import Marker
-
-    from der_planner.control.force import untouched
-    from der_planner.limb import Limb
-    from der_planner.nodes.planner_topics import PlannerPublishers
-    from der_planner.planning import Motion, plan
-    from der_planner.planning.streaming import Schedule
-    from limb_interfaces import topics
-    from limb_interfaces.stamps import nanoseconds, stamp_from_nanoseconds
-
     sent = {}
     node = Mock()
     node.create_publisher = lambda _, topic, __: Mock(
@@ -126,13 +109,6 @@ def test_a_touch_is_published_and_drawn_while_it_lasts():
 @pytest.mark.slow
 def test_solutions_that_take_too_long_never_hold_up_the_plan():
     """Every command comes too late: setpoints go out meanwhile, and then the plan is left alone."""
-    from der_msgs.msg import LimbState
-    from der_planner.control import Feedback
-    from der_planner.limb import Limb
-    from der_planner.nodes.planner_feedback import Corrector
-    from der_planner.planning import Motion, plan
-    from der_planner.planning.streaming import Schedule
-    from limb_interfaces.stamps import stamp_from_nanoseconds
 
     class Slow(Feedback):
         def __init__(self, plan):
