@@ -138,20 +138,14 @@ def _point_wheels_at_this_machine() -> None:
         path.write_text(text, errors="surrogateescape")
 
 
-_LIST_INSTALLED = """
-import importlib.metadata as metadata
-for item in metadata.distributions():
-    if (item.read_text("INSTALLER") or "").strip() == "pip":
-        print(f"{item.metadata['Name'].lower().replace('_', '-')}=={item.version}")
-"""
-
-
 def write_lock() -> None:
     """Write what pip installed; the ROS wheels also carry packages that PyPI does not know."""
-    command = [VENV / "bin" / "python", "-c", _LIST_INSTALLED]
-    installed = subprocess.check_output(command, text=True, env=clean_environment())
-    own = ("pip==", "setuptools==")
-    names = sorted(line for line in set(installed.split()) if not line.startswith(own))
+    command = [VENV / "bin" / "python", "-m", "pip", "inspect", "--local"]
+    told = json.loads(subprocess.check_output(command, text=True, env=clean_environment()))
+    by_pip = [each["metadata"] for each in told["installed"] if each.get("installer") == "pip"]
+    versions = {each["name"].lower().replace("_", "-"): each["version"] for each in by_pip}
+    own = ("pip", "setuptools")
+    names = sorted(f"{name}=={held}" for name, held in versions.items() if name not in own)
     lock_file().write_text("\n".join(names) + "\n")
     (VENV / "workspace.json").write_text(json.dumps({"requirements": _requirements_digest()}))
     say(f"{len(names)} versions in {lock_file().relative_to(ROOT)}")
