@@ -12,13 +12,15 @@ from __future__ import annotations
 import argparse
 import mmap
 import re
+import struct
 import sys
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from io import BytesIO
 from pathlib import Path
-from typing import Any
 
+from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Footer, McapRecord, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 
@@ -30,8 +32,8 @@ from der_planner.bags.writer import METADATA_FILE, RUN_KEY, BagWriter
 # that is whole is read, wherever it lies, and its messages are written again.
 
 MAGIC = b"\x89MCAP0\r\n"
-_HEAD = 9
-"""Bytes of a record's opcode and length."""
+_HEAD = struct.Struct("<BQ")
+"""A record's opcode and length."""
 _CHUNK_NUMBERS = 40
 """Bytes of a chunk beside its messages and the name of their compression."""
 _CHUNK = re.compile(rb"\x06.{6}\0\0.{28}(?:\0{4}|\x03\0{3}lz4|\x04\0{3}zstd)", re.DOTALL)
@@ -67,9 +69,7 @@ class _File:
     def __init__(self, path: Path) -> None:
         with path.open("rb") as file:
             is_empty = path.stat().st_size == 0
-            self._data: Any = b""
-            if not is_empty:
-                self._data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+            self._data = b"" if is_empty else mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         self._is_closed = self._data[-len(MAGIC) :] == MAGIC
         self.lost_bytes = 0
         self.has_index = False
@@ -112,29 +112,29 @@ class _File:
         place = len(MAGIC) if self._data[: len(MAGIC)] == MAGIC else 0
         end = len(self._data) - len(MAGIC) * self._is_closed
         while place < end:
-            self._data.seek(place)
             try:
-                for record in StreamReader(self._data, skip_magic=True, emit_chunks=True).records:
-                    self._check_lengths(record, place)
-                    if isinstance(record, Chunk):
-                        self.compression = record.compression or "none"
-                        yield from breakup_chunk(record, validate_crc=True)
-                    else:
-                        yield record
-                    place = self._data.tell()
+                records, after = self._read(place)
+                yield from records
             except Exception:  # whatever a parser or decompressor makes of damaged bytes
                 found = _CHUNK.search(self._data, place + 1)
                 after = found.start() if found else end
                 self.lost_bytes += after - place
-                place = after
+            place = after
 
-    def _check_lengths(self, record: McapRecord, place: int) -> None:
-        """Refuse a record that was read from ``place`` on by lengths that do not fit together."""
-        told = inside = int.from_bytes(self._data[place + 1 : place + _HEAD], "little")
-        if isinstance(record, Chunk):
-            inside = _CHUNK_NUMBERS + len(record.compression) + len(record.data)
-        if not self._data.tell() - place - _HEAD == told == inside:
-            raise RecoverError("the lengths do not fit")
+    def _read(self, place: int) -> tuple[list[McapRecord], int]:
+        """Return the records that begin at a byte, several for a chunk, and where they end."""
+        opcode, length = _HEAD.unpack_from(self._data, place)
+        after = place + _HEAD.size + length
+        if not 0 < opcode <= max(Opcode) or after > len(self._data):
+            raise RecoverError("no record begins here")
+        stream = BytesIO(self._data[place:after])
+        record = next(StreamReader(stream, skip_magic=True, emit_chunks=True).records)
+        if not isinstance(record, Chunk):
+            return [record], after
+        if _CHUNK_NUMBERS + len(record.compression) + len(record.data) != length:
+            raise RecoverError("the lengths inside do not fit")
+        self.compression = record.compression or "none"
+        return breakup_chunk(record, validate_crc=True), after
 
 
 def _topic_spec(channel: Channel, schema: Schema) -> TopicSpec:
