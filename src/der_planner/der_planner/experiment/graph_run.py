@@ -12,7 +12,6 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.executors import ExternalShutdownException
@@ -312,11 +311,8 @@ def experiment_page(options: Options, progress: Progress) -> Iterator[NodeProces
         NodeError: it cannot be started, or has ended at once.
         GraphError: it is not ready in time.
     """
-    planner: dict[str, Any] = {
-        "limb_file": str(options.limb or ""), "mounting": options.load.mounting,
-    }  # fmt: skip
-    planner |= {"payload": options.load.payload, "payload_at": options.load.payload_at}
-    setup = GraphSetup(Path(), {}, hardware=options.hardware, planner=planner, page=options.page)
+    shown = {"limb_file": str(options.limb or ""), **options.load._asdict()}
+    setup = GraphSetup(Path(), {}, hardware=options.hardware, planner=shown, page=options.page)
     (spec,) = [each for each in setup.nodes("") if each.executable == "page"]
     parameters = {**spec.parameters, "report": str(options.out / "report")}
     page = NodeProcess(

@@ -110,9 +110,7 @@ def _planner_parameters(run: TrialRun) -> dict[str, Any]:
     trial, options = run.trial, run.options
     parameters: dict[str, Any] = {
         "limb_file": str(run.limb_file or ""),
-        "mounting": options.load.mounting,
-        "payload": options.load.payload,
-        "payload_at": options.load.payload_at,
+        **options.load._asdict(),
         "feedback": trial.feedback,
         "reaction": options.reaction,
         "force_limit": options.force_limit,

@@ -21,6 +21,8 @@ from der_planner.twin.offline import OfflineTwin
 
 _AT_REST = 1.0
 """The twin is vented this long [s] before the first setpoint."""
+_NAMED = ("motion", "model", "trial", "seed", "cycles", "limb")
+"""What a kept run and its description name alike."""
 
 
 def play_offline(run: TrialRun, progress: Progress) -> dict[str, Any]:
@@ -92,15 +94,10 @@ def load_arrays(path: Path) -> RunSeries:
         about = json.loads(str(kept["metadata"]))
         return RunSeries.from_arrays(
             Description(
-                motion=about["motion"],
-                model=about["model"],
+                **{name: about[name] for name in _NAMED},
                 method=method_name(about["method"], about.get("learned_from")),
-                trial=about["trial"],
-                seed=about["seed"],
                 amplitude=about["amplitude_rad"],
                 period=about["period_s"],
-                cycles=about["cycles"],
-                limb=about["limb"],
                 bag=str(path),
                 gravity=tuple(about.get("gravity_m_s2", (0.0, 0.0, 0.0))),
                 payload=about.get("payload_kg", 0.0),
