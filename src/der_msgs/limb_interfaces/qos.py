@@ -52,3 +52,16 @@ would be frames of the past for a tracker that is too slow."""
 
 LEASES = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Signs of an operator: one that a network held up must not come later in place of a newer one."""
+
+
+def profile(depth: int, reliable: bool, kept: bool) -> QoSProfile:
+    """Return the profile of a recorded topic.
+
+    Args:
+        depth: messages that may wait.
+        reliable: what is lost on the way is sent again.
+        kept: the last messages are there for those who come later.
+    """
+    reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+    durability = DurabilityPolicy.TRANSIENT_LOCAL if kept else DurabilityPolicy.VOLATILE
+    return QoSProfile(depth=depth, reliability=reliability, durability=durability)

@@ -168,13 +168,18 @@ class TopicSpec:
         return cls(name, type_name, *find_definition(type_name), qos)
 
     @property
+    def kept(self) -> bool:
+        """Whether every publisher keeps its last messages for those who come later."""
+        return bool(self.qos) and all(q.durability == "transient_local" for q in self.qos)
+
+    @property
     def latched(self) -> bool:
         """Whether the last message before a recording begins goes into the bag, too.
 
-        ``/rosout`` is published so, too, but an old log line is no state that anyone waits for.
+        ``/rosout`` is kept by its publishers, but an old log line is no state that anyone waits
+        for.
         """
-        kept = all(profile.durability == "transient_local" for profile in self.qos)
-        return bool(self.qos) and kept and self.name != LOG_TOPIC
+        return self.kept and self.name != LOG_TOPIC
 
     def qos_yaml(self) -> str:
         """Return the offered profiles as the string that MCAP channels carry."""

@@ -20,7 +20,7 @@ from pathlib import Path
 
 from rclpy.duration import Duration
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
 
 from der_planner.bags.reader import BagError, BagReader, RawMessage, RecordedTopic
@@ -35,9 +35,12 @@ from der_planner.experiment.console import (
     run_command,
 )
 from der_planner.experiment.processes import GraphError
+from limb_interfaces import qos
 
 CLOCK_PERIOD = NANOSECONDS // 100
 """Recorded time between two messages on ``/clock`` [ns] while nothing else is due."""
+DEPTH = 100
+"""So many messages of a topic may wait for their receivers, and answers for this program."""
 ATTEMPTS = 3
 PATIENCE = 3.0
 """Longest wait for one answer [s]; then the message is sent again."""
@@ -165,7 +168,11 @@ class GraphOutput:
         self._answers: set[bytes] = set()
         node = client.node
         self._publishers: dict[str, Publisher] = {
-            name: node.create_publisher(message_class(topic.type_name), name, _profile(topic))
+            name: node.create_publisher(
+                message_class(topic.type_name),
+                name,
+                qos.profile(DEPTH, topic.reliable, topic.latched),
+            )
             for name, topic in topics.items()
         }
         self._clock = node.create_publisher(Clock, "/clock", 10)
@@ -179,7 +186,7 @@ class GraphOutput:
                 message_class(kind[0]),
                 answer,
                 lambda data: self._answers.add(_stamp(data)),
-                QoSProfile(depth=100),
+                QoSProfile(depth=DEPTH),
                 raw=True,
             )
 
@@ -218,16 +225,6 @@ class GraphOutput:
         message = Clock()
         message.clock.sec, message.clock.nanosec = divmod(now, NANOSECONDS)
         self._clock.publish(message)
-
-
-def _profile(topic: RecordedTopic) -> QoSProfile:
-    reliable, best = ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT
-    latched, volatile = DurabilityPolicy.TRANSIENT_LOCAL, DurabilityPolicy.VOLATILE
-    return QoSProfile(
-        depth=100,
-        reliability=reliable if topic.reliable else best,
-        durability=latched if topic.latched else volatile,
-    )
 
 
 def _arguments() -> argparse.Namespace:

@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 from std_srvs.srv import Trigger
@@ -18,7 +18,7 @@ from std_srvs.srv import Trigger
 from der_planner.bags.session import RecordingSession
 from der_planner.bags.topics import DefinitionError, OfferedQos, TopicSpec, message_class
 from der_planner.bags.writer import COMPRESSIONS, RUN_KEY, BagWriteError, BagWriter
-from limb_interfaces import parameters, topics
+from limb_interfaces import parameters, qos, topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
 from limb_interfaces.parameters import check_overrides
 from limb_interfaces.runner import run_node
@@ -131,16 +131,16 @@ class Recorder(Node):
                 self._refuse(name, f"has several types: {', '.join(types)}")
                 continue
             publishers = self.get_publishers_info_by_topic(name)
-            qos = offered_qos(publishers)
+            offered = offered_qos(publishers)
             source = self._sources.get(name)
-            if source is not None and qos and qos != source.spec.qos:
-                if _profile(source.spec) == _profile(replace(source.spec, qos=qos)):
-                    source.spec = replace(source.spec, qos=qos)
+            if source is not None and offered and offered != source.spec.qos:
+                if _profile(source.spec) == _profile(replace(source.spec, qos=offered)):
+                    source.spec = replace(source.spec, qos=offered)
                 else:
                     self._unsubscribe(name)
                     source = None
             if source is None:
-                self._subscribe(name, types[0], qos)
+                self._subscribe(name, types[0], offered)
             else:
                 source.count_again(len(publishers))
 
@@ -154,11 +154,11 @@ class Recorder(Node):
             self._refused[name] = reason
             self.get_logger().warning(f"not recording {name}: {reason}")
 
-    def _subscribe(self, name: str, type_name: str, qos: tuple[OfferedQos, ...]) -> None:
+    def _subscribe(self, name: str, type_name: str, offered: tuple[OfferedQos, ...]) -> None:
         if name in self._refused:
             return
         try:
-            spec = TopicSpec.installed(name, type_name, qos)
+            spec = TopicSpec.installed(name, type_name, offered)
             kind = message_class(type_name)
         except DefinitionError as error:
             self._refuse(name, str(error))
@@ -326,13 +326,7 @@ def _profile(spec: TopicSpec) -> QoSProfile:
     """Return the strictest profile that every publisher still matches."""
     is_image = spec.type_name == IMAGE_TYPE
     reliable = not is_image and all(q.reliability == "reliable" for q in spec.qos)
-    kept = bool(spec.qos) and all(q.durability == "transient_local" for q in spec.qos)
-    return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST,
-        depth=IMAGE_DEPTH if is_image else DEPTH,
-        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL if kept else DurabilityPolicy.VOLATILE,
-    )
+    return qos.profile(IMAGE_DEPTH if is_image else DEPTH, reliable, spec.kept)
 
 
 def main() -> int:
