@@ -107,6 +107,16 @@ def test_a_hole_takes_the_chunks_that_it_touches_and_no_other(
         shutil.rmtree(found.folder)
 
 
+def test_damaged_repetitions_of_a_definition_change_no_topic(tmp_path: Path):
+    folder = tmp_path / "run"
+    write_chunks(folder, 4)
+    first, *others = (folder / "run_0.mcap").read_bytes().split(b"/talk")
+    (folder / "run_0.mcap").write_bytes(b"/tulk".join([first + b"/talk" + others[0], *others[1:]]))
+    assert numbers(recover_bag(folder, tmp_path / "saved").folder) == list(range(20))
+    with BagReader(tmp_path / "saved") as reader:
+        assert set(reader.topics) == {"/talk"}
+
+
 @pytest.mark.parametrize("repeated", [True, False])
 def test_topics_are_known_though_the_first_chunk_is_damaged(tmp_path, monkeypatch, repeated):
     if not repeated:  # as in bags of recorders that say it once

@@ -1,6 +1,8 @@
 """What ends a run ends it once, with its name: also what a closed terminal or a quit key sends."""
 
 import signal
+import subprocess
+import sys
 
 import pytest
 
@@ -21,6 +23,29 @@ def test_a_second_signal_does_not_cut_the_end_short(number: signal.Signals):
     finally:
         for each, handler in before.items():
             signal.signal(each, handler)
+
+
+def test_a_signal_that_comes_while_an_object_is_deleted_still_ends_the_run():
+    code = """
+import signal, time
+from der_planner.experiment.console import interrupt_once
+
+class Item:
+    def __del__(self):
+        signal.raise_signal(signal.SIGTERM)
+
+interrupt_once()
+Item()
+try:
+    time.sleep(60.0)
+except KeyboardInterrupt as error:
+    print(error)
+"""
+    found = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=30.0, check=True
+    )
+    assert found.stdout == "SIGTERM\n"
+    assert not found.stderr
 
 
 @pytest.mark.parametrize("state", ["vented", "idle"])

@@ -81,10 +81,11 @@ class _File:
         for record in self._records():
             if isinstance(record, Message):
                 counts[record.channel_id] += 1
+            # The first definition is inside a chunk, whose checksum tells that it is whole.
             elif isinstance(record, Schema):
-                schemas[record.id] = record
+                schemas.setdefault(record.id, record)
             elif isinstance(record, Channel):
-                channels[record.id] = record
+                channels.setdefault(record.id, record)
             elif isinstance(record, Metadata) and record.name == RUN_KEY:
                 self.custom_data = dict(record.metadata)
             elif isinstance(record, Footer):

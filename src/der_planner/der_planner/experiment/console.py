@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -79,6 +80,16 @@ def interrupt_once() -> None:
         on_end_signals(signal.SIG_IGN)
         raise KeyboardInterrupt(signal.Signals(number).name)
 
+    def lost(dropped: sys.UnraisableHookArgs) -> None:
+        if dropped.exc_type is not KeyboardInterrupt:
+            sys.__unraisablehook__(dropped)
+            return
+        # Python drops what is raised while it deletes an object: the signal comes once more.
+        on_end_signals(interrupt)
+        number = signal.Signals[str(dropped.exc_value)]
+        threading.Timer(0.1, os.kill, (os.getpid(), number)).start()
+
+    sys.unraisablehook = lost
     on_end_signals(interrupt)
 
 
