@@ -5,12 +5,13 @@ import sys
 
 import pytest
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticArray
 from domain import own_domain
 from rclpy.exceptions import ParameterNotDeclaredException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from statuses import status
 
 from limb_interfaces import runner
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
@@ -77,14 +78,10 @@ def test_a_second_node_of_a_name_ends_with_the_remedy():
         executor = SingleThreadedExecutor(context=made.context)
         executor.add_node(made)
 
-        def status(**values):
-            pairs = [KeyValue(key=key, value=value) for key, value in values.items()]
-            return DiagnosticArray(status=[DiagnosticStatus(name="/twice", values=pairs)])
-
         told = made.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        told.publish(status(process="lab:1", started="9e99"))
+        told.publish(DiagnosticArray(status=[status("/twice", process="lab:1", started="9e99")]))
         assert publisher.publish() == "ok"
-        told.publish(status(process="lab:2", started="17.0"))
+        told.publish(DiagnosticArray(status=[status("/twice", process="lab:2", started="17.0")]))
         for _ in range(1000):
             if hasattr(made, "fatal_error"):
                 break

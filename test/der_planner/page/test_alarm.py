@@ -9,8 +9,8 @@ import sys
 from typing import Any
 
 import pytest
-from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import Log
+from statuses import status
 from waiting import Clock, wait_for
 
 from der_msgs.msg import LimbContact, PressureState
@@ -23,11 +23,6 @@ def state(mode: int, measured: float = 0.0, **fields: Any) -> PressureState:
         mode=mode, measured_differential=[measured, 0.0], commanded_differential=[0.0, 0.0],
         **fields,
     )  # fmt: skip
-
-
-def status(name: str, **values: str) -> DiagnosticStatus:
-    pairs = [KeyValue(key=key, value=value) for key, value in values.items()]
-    return DiagnosticStatus(name=name, level=b"\0", message="well", values=pairs)
 
 
 def alarms(situation: Situation) -> list[dict[str, Any]]:
@@ -90,7 +85,7 @@ def test_a_driver_that_ended_says_why_and_how_it_was_started(situation: Situatio
     assert process.stdout is not None
     process.stdout.readline()  # before it runs, the system may know no command line of it
     here = f"{socket.gethostname()}:{process.pid}"
-    situation.put_status(driver_at(here))
+    situation.put_status(status("/limb/pressure_driver", process=here))
     situation.put_driver(state(PressureState.ARMED))
     words = "no sign of life of the port's process for 1 s"
     situation.put_log(Log(level=20, name="limb.pressure_driver", msg="an ordinary line"))
@@ -102,12 +97,10 @@ def test_a_driver_that_ended_says_why_and_how_it_was_started(situation: Situatio
     assert f"its process has ended — {words}. When last heard, the limb was" in alarm["text"]
     assert alarm["advice"].endswith("port:=/dev/mine")
     process.wait()
-    situation.put_status(driver_at("elsewhere:1"))  # it was started again
+    situation.put_status(
+        status("/limb/pressure_driver", process="elsewhere:1")
+    )  # it was started again
     assert alarms(situation) == []
-
-
-def driver_at(process: str) -> DiagnosticStatus:
-    return status("/limb/pressure_driver", process=process)
 
 
 def test_a_fault_and_a_lost_operator_are_told(situation: Situation) -> None:
@@ -164,9 +157,7 @@ def test_a_node_of_another_limb_does_not_pass_for_this_ones(
 def test_nodes_that_were_ended_in_order_alarm_nobody(situation: Situation, clock: Clock) -> None:
     situation.put_driver(state(PressureState.DISARMED))
     for name in ("pressure_driver", "planner"):
-        last = status(f"/limb/{name}")
-        last.message = ENDED_IN_ORDER
-        situation.put_status(last)
+        situation.put_status(status(f"/limb/{name}", ENDED_IN_ORDER))
     clock.now += 100.0
     (alarm,) = alarms(situation)
     assert alarm["level"] == "notice"
@@ -176,9 +167,7 @@ def test_nodes_that_were_ended_in_order_alarm_nobody(situation: Situation, clock
 
 def test_a_recorder_that_has_stopped_alarms(situation: Situation) -> None:
     situation.put_driver(state(PressureState.TRACKING))
-    failed = status("/limb/recorder")
-    failed.level, failed.message = b"\2", "fewer than 64 MiB are free"
-    situation.put_status(failed)
+    situation.put_status(status("/limb/recorder", "fewer than 64 MiB are free", b"\2"))
     (alarm,) = alarms(situation)
     assert alarm["text"] == "The recorder does not record: fewer than 64 MiB are free"
 
@@ -187,9 +176,7 @@ def test_an_experiment_between_two_runs_alarms_nobody(situation: Situation, cloc
     situation.put_status(status("/limb/experiment"))
     assert alarms(situation) == []  # it calibrates: no driver has run yet
     situation.put_driver(state(PressureState.DISARMED))
-    last = status("/limb/pressure_driver")
-    last.message = ENDED_IN_ORDER
-    situation.put_status(last)
+    situation.put_status(status("/limb/pressure_driver", ENDED_IN_ORDER))
     clock.now += 1.0
     assert alarms(situation) == []
     clock.now += DEAD

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from statuses import status
 
 from der_msgs.msg import MotionCommand
 from der_planner.page import commands
@@ -34,9 +34,7 @@ class Graph:
         return [SimpleNamespace(node_name=name) for name in self.listeners]
 
     def _hear(self, command: MotionCommand) -> None:
-        said = self._say(command.plan_id)
-        values = [KeyValue(key=key, value=value) for key, value in said.items()]
-        self.situation.put_status(DiagnosticStatus(name="/limb/planner", values=values))
+        self.situation.put_status(status("/limb/planner", **self._say(command.plan_id)))
 
     def play(self) -> Answer:
         page = Commands(self, self.situation, 2)  # type: ignore[arg-type]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from statuses import status
 
 from der_msgs.msg import LimbState, PressureState
 from der_planner.page.setup_guide import SetupGuide, Step
@@ -32,9 +32,7 @@ class GuidedSetup:
 
     def plan_for(self, limb: str, identified: str) -> None:
         """Let the planner say for which limb it plans, and when that was identified."""
-        told = {"limb": limb, "limb_identified": identified}
-        values = [KeyValue(key=key, value=value) for key, value in told.items()]
-        self.situation.put_status(DiagnosticStatus(name="/limb/planner", values=values))
+        self.situation.put_status(status("/limb/planner", limb=limb, limb_identified=identified))
 
     def steps(self, problem: str = "", calibrated: bool = True) -> list[Step]:
         return self.guide.steps(self.situation.snapshot(), problem, calibrated)
@@ -75,8 +73,7 @@ def test_each_chamber_counts_only_if_it_is_driven_alone() -> None:
 @pytest.mark.parametrize("limit", [4e3, 250e3])
 def test_chambers_of_other_limbs_count_at_the_same_share_of_the_drivers_limit(limit: float) -> None:
     rig = GuidedSetup()
-    told = KeyValue(key="pressure_limit_pa", value=f"{limit:g}")
-    rig.situation.put_status(DiagnosticStatus(name="/limb/pressure_driver", values=[told]))
+    rig.situation.put_status(status("/limb/pressure_driver", pressure_limit_pa=f"{limit:g}"))
     rig.drive((0.04 * limit, 0.0))
     assert rig.steps()[1].done
     for measured in ((0.12, 0.0), (0.2, 0.05), (-0.13, 0.0), (0.0, 0.2)):
@@ -115,7 +112,7 @@ def test_a_run_is_seen_while_and_after_it_is_played(plan: str, step: int) -> Non
 
 def test_with_motion_capture_no_camera_is_asked_for() -> None:
     rig = GuidedSetup()
-    rig.situation.put_status(DiagnosticStatus(name="/limb/pose_tracker"))
+    rig.situation.put_status(status("/limb/pose_tracker"))
     steps = rig.steps("no calibration yet", calibrated=False)
     assert [step.done for step in steps[3:6]] == [True, True, False]
     assert "motion capture" in steps[3].seen

@@ -11,8 +11,8 @@ import subprocess
 import sys
 
 import pytest
-from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Point
+from statuses import status
 from waiting import Clock, wait_for
 
 from der_msgs.msg import LimbState, PressurePlan, PressureState
@@ -32,11 +32,6 @@ def view(stamp: int, tip: tuple[float, float] = (0.2, 0.05), valid: bool = True)
     message = LimbState(valid=valid, tip=Point(x=tip[0], y=tip[1]), bend_angle=[math.pi / 4, 0.0])
     message.header.stamp = stamp_from_nanoseconds(stamp)
     return message
-
-
-def status(name: str, message: str, level: bytes = b"\0", process: str = "") -> DiagnosticStatus:
-    values = [KeyValue(key="process", value=process)]
-    return DiagnosticStatus(name=name, level=level, message=message, values=values)
 
 
 def test_data_grow_old(situation: Situation, clock: Clock) -> None:
