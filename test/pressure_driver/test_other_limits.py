@@ -29,17 +29,6 @@ def swing(limit):
     return lambda t: (0.8 * limit * np.sin(2.0 * t), -0.8 * limit * np.sin(2.0 * t))
 
 
-def fault_after(sim, shape, seconds):
-    """Play until the driver faults; return the seconds it took."""
-    begin = sim.steady
-    for index in range(round(seconds * 20)):
-        sim.offer(shape(sim.steady - begin), plan_id="next", index=index)
-        sim.tick()
-        if sim.mode is Mode.FAULT:
-            return sim.steady - begin
-    raise AssertionError("not noticed")
-
-
 def test_a_limit_alone_makes_the_other_pressures_and_what_is_given_stays():
     usual = Settings()
     for limit in LIMITS:
@@ -89,7 +78,7 @@ def test_a_broken_chamber_is_noticed_as_soon(simulate, protocol, limit, fault, r
     sim.arm()
     sim.stream(5.0, rise(limit))
     sim.have(fault)
-    assert fault_after(sim, lambda _: rise(limit)(5.0), longest) <= longest
+    assert sim.play_until_fault(longest, lambda _: rise(limit)(5.0), "next") <= longest
     assert re.search(reason, sim.faults[0])
     assert sim.gauge.max() < 1.3 * limit
 
@@ -100,7 +89,7 @@ def test_a_supply_that_is_lost_is_noticed_at_once(simulate, limit):
     sim.arm()
     sim.stream(3.0, swing(limit))
     sim.have(f"supply:{1e5 + 0.5 * limit}")
-    assert fault_after(sim, swing(limit), 1.0) < 1.0
+    assert sim.play_until_fault(1.0, swing(limit), "next") < 1.0
     assert "supply too low" in sim.faults[0]
 
 

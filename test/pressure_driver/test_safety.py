@@ -1,5 +1,6 @@
 """Every refusal and every fault, in simulated time."""
 
+import functools
 import re
 from dataclasses import replace
 
@@ -35,14 +36,8 @@ FAULTS = {
 }
 
 
-def push(sim, seconds, pulsation=1.2):
-    """Swing segment 0, and offer setpoints for as long as the driver takes them."""
-    for index in range(round(seconds / 0.05)):
-        first = 9_000.0 * np.cos(pulsation * index * 0.05)
-        sim.offer((first, -5_000.0), plan_id="push", index=index)
-        sim.tick()
-        if sim.mode is Mode.FAULT:
-            return
+def swing(t, pulsation=1.2):
+    return (9_000.0 * np.cos(pulsation * t), -5_000.0)
 
 
 @pytest.mark.parametrize(
@@ -55,11 +50,9 @@ def test_every_fault_ends_vented(simulate, protocol, name):
     sim = simulate(protocol)
     sim.track()
     sim.have(fault)
-    begin = sim.steady
     # A leak shows while a chamber is to be kept full.
-    push(sim, limit, pulsation=0.0 if name == "leak" else 1.2)
-    assert sim.mode is Mode.FAULT, "not noticed"
-    assert sim.steady - begin <= limit
+    shape = functools.partial(swing, pulsation=0.0 if name == "leak" else 1.2)
+    assert sim.play_until_fault(limit, shape, "push") <= limit
     assert any(part in " ".join(sim.faults) for part in reason.split("|")), sim.faults
     sim.tick()
     assert sim.is_vent(sim.sent[-1])
@@ -103,8 +96,7 @@ def test_an_unplug_vents_after_the_reconnect_and_wants_arming(simulate, protocol
     sim.track()
     sim.plugged = False
     sim.core.lost("serial link lost: pulled")
-    push(sim, 1.0)
-    assert sim.mode is Mode.FAULT
+    assert sim.play_until_fault(1.0, swing, "push")
     assert sim.faults == ("serial link lost: pulled",)
     sim.plugged = True
     greeting = sim.core.opening()
