@@ -9,6 +9,7 @@ import time
 # One core, as the figures say; set before numpy starts its threads.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+from benchmarks import show
 from der_planner.limb import Limb
 from der_planner.planning import METHODS, Motion, plan
 
@@ -61,8 +62,5 @@ def speed(repetitions: int) -> dict[str, float | str]:
         name = f"{model}_{method}_40s"
         figures[f"{name}_wall_s"], figures[f"{name}_cpu_s"] = min(walls), min(cpus)
         figures[f"{name}_times_real_time"] = result.duration / min(cpus)
-        print(
-            f"  {model} {method:10} {min(walls):7.3f} s wall  {min(cpus):7.3f} s processor  "
-            f"{result.duration / min(cpus):7.0f} times real time"
-        )
+    show(figures)
     return figures

@@ -8,8 +8,8 @@ is overconfident.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-import os
 import tempfile
 import time
 from collections.abc import Callable
@@ -25,18 +25,19 @@ from apriltag_tracker.pipeline import LimbTracker
 from apriltag_tracker.synthetic.camera import CameraModel, Optics, SyntheticCamera
 from apriltag_tracker.synthetic.shapes import Shape, constant_curvature
 from apriltag_tracker.tag_map import TagMap
-from benchmarks import cpu_time
+from benchmarks import cpu_time, show
 from benchmarks.tracker.renderer import Scene, render
 from der_msgs.msg import ChamberPressures, LimbState
 from der_planner.experiment.client import GraphClient
-from der_planner.experiment.processes import NodeProcess
+from der_planner.experiment.console import Progress
+from der_planner.experiment.graph_run import RunningGraph
+from der_planner.experiment.processes import NodeSpec
 from limb_interfaces import qos, topics
 from limb_interfaces.stamps import nanoseconds
 from workspace_setup.basics import ROOT
 
 CONFIG = ROOT / "src" / "apriltag_tracker" / "config"
 PERIOD = 1.0 / 30.0
-_DOMAIN = "97"
 SCENES = (
     Scene("14px", pixels=14.0, blur=0.5),
     Scene("20px", pixels=20.0),
@@ -194,7 +195,8 @@ def measure_swing(frames: int, exposure: float) -> dict[str, float]:
         "render_cpu_ms": float(np.median(renders)),
     }
     name = f"swing_{1e3 * exposure:.0f}ms"
-    _show(f"A limb that swings, {1e3 * exposure:.0f} ms of exposure, {frames} pictures", result)
+    print(f"\nA limb that swings, {1e3 * exposure:.0f} ms of exposure, {frames} pictures")
+    show(result)
     return {f"{name}_{key}": value for key, value in result.items()}
 
 
@@ -202,39 +204,30 @@ def measure_graph(seconds: float) -> dict[str, float]:
     """Run twin, camera and tracker as nodes and compare the tracker's tip with the twin's own."""
     states: dict[int, LimbState] = {}
     truth: dict[int, LimbState] = {}
-    names = {"limb_twin": "der_planner", "synthetic_camera": "apriltag_tracker"}
-    names["apriltag_tracker"] = "apriltag_tracker"
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        GraphClient("tracker_benchmark", int(_DOMAIN)) as client,
-    ):
-        environment = {**os.environ, "ROS_DOMAIN_ID": _DOMAIN}
-        nodes = {
-            name: NodeProcess(package, name, {}, Path(folder), None, environment, name)
-            for name, package in names.items()
-        }
-        try:
-            client.watch(list(nodes.values()))
-            for topic, kept in ((topics.LIMB_STATE, states), (topics.TWIN_GROUND_TRUTH, truth)):
-                client.subscribe(
-                    LimbState,
-                    topic,
-                    qos.STATES,
-                    lambda message, kept=kept: kept.update(
-                        {nanoseconds(message.header.stamp): message}
-                    ),
-                )
-            _press(client)
-            client.wait_for(lambda: len(states) > 60, 60.0, "the tracker")
-            states.clear()
-            before = {name: cpu_time(node.pid) for name, node in nodes.items()}
-            started = time.monotonic()
-            client.spin(seconds)
-            took = time.monotonic() - started
-            cpu = {name: cpu_time(node.pid) - before[name] for name, node in nodes.items()}
-        finally:
-            for node in nodes.values():
-                node.stop()
+    packages = {"limb_twin": "der_planner"}
+    packages |= dict.fromkeys(("synthetic_camera", "apriltag_tracker"), "apriltag_tracker")
+    with contextlib.ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        client = stack.enter_context(GraphClient("benchmark"))
+        for topic, kept in ((topics.LIMB_STATE, states), (topics.TWIN_GROUND_TRUTH, truth)):
+
+            def keep(message: LimbState, kept: dict[int, LimbState] = kept) -> None:
+                kept[nanoseconds(message.header.stamp)] = message
+
+            client.subscribe(LimbState, topic, qos.STATES, keep)
+        _press(client)
+        graph = RunningGraph(client, Progress())
+        stack.callback(graph.stop)
+        specs = [NodeSpec(package, name) for name, package in packages.items()]
+        graph.start(specs, folder, {})
+        client.wait_for(lambda: len(states) > 60, 60.0, "the tracker")
+        states.clear()
+        numbers = {name: process.pid for name, process in graph.processes.items()}
+        before = {name: cpu_time(number) for name, number in numbers.items()}
+        started = time.monotonic()
+        client.spin(seconds)
+        took = time.monotonic() - started
+        cpu = {name: cpu_time(number) - before[name] for name, number in numbers.items()}
     both = [stamp for stamp in states if stamp in truth and states[stamp].valid]
     gaps = 1e3 * np.array(
         [(states[k].tip.x - truth[k].tip.x, states[k].tip.y - truth[k].tip.y) for k in both]
@@ -249,7 +242,8 @@ def measure_graph(seconds: float) -> dict[str, float]:
         "graph_latency_p99_ms": float(np.percentile(latency, 99)),
     }
     result.update({f"graph_cpu_{name}_percent": 100.0 * used / took for name, used in cpu.items()})
-    _show(f"Nodes, {took:.0f} s; latency from the shape's stamp to the published tip", result)
+    print(f"\nNodes, {took:.0f} s; latency from the shape's stamp to the published tip")
+    show(result)
     return result
 
 
@@ -270,12 +264,6 @@ def _press(client: GraphClient) -> None:
         publisher.publish(message)
 
     client.node.create_timer(0.02, publish)
-
-
-def _show(title: str, figures: dict[str, float]) -> None:
-    print(f"\n{title}")
-    for key, value in figures.items():
-        print(f"  {key:42s} {value:9.3f}", flush=True)
 
 
 def run(quick: bool) -> dict[str, float | str]:
