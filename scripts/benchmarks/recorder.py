@@ -16,7 +16,7 @@ import numpy as np
 from geometry_msgs.msg import Point
 from rclpy.serialization import serialize_message
 
-from benchmarks import cpu_time
+from benchmarks import cpu_time, show
 from der_msgs.msg import (
     LimbState,
     PressurePlan,
@@ -192,9 +192,6 @@ def run(quick: bool) -> dict[str, float | str]:
     figures: dict[str, float | str] = {}
     figures |= record_images(8.0 if quick else 60.0)
     figures |= kill_and_recover(3.0 if quick else 8.0)
-    short = evaluate_long_bag(1.0)
     figures |= evaluate_long_bag(2.0 if quick else 20.0)
-    figures["evaluation_peak_memory_of_1_min_MB"] = short["evaluation_peak_memory_MB"]
-    for name, value in figures.items():
-        print(f"  {name:<36} {value:.4g}" if isinstance(value, float) else f"  {name:<36} {value}")
+    show(figures)
     return figures
