@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from limbs import with_segments
 
 from der_planner.control.force import untouched
 from der_planner.control.free_level import FreeLevel, Lacking
@@ -219,11 +220,8 @@ def test_a_payload_that_was_weighed_is_known_again():
 
 def rubbing() -> RodModel:
     """Return a limb whose friction is worth 900 Pa."""
-    segments = [
-        replace(s, friction_moment=900.0 * s.moment_gain, friction_curvature=0.8)
-        for s in LIMB.segments
-    ]
-    return RodModel(replace(LIMB, segments=tuple(segments)))
+    friction = {"friction_moment": lambda s: 900.0 * s.moment_gain, "friction_curvature": 0.8}
+    return RodModel(with_segments(LIMB, **friction))
 
 
 def test_friction_that_is_larger_and_less_even_than_said_is_no_touch():

@@ -23,18 +23,15 @@ RUBBING = with_segments(
 
 def another_day(limb, gain=(1.0, 1.0), rest=(0.0, 0.0), friction=(1.0, 1.0)):
     """Return a limb whose gains, rest angles [rad] and frictions have changed."""
-    segments = zip(limb.segments, gain, rest, friction, strict=True)
-    return replace(
+    return with_segments(
         limb,
-        segments=tuple(
-            replace(
-                s,
-                moment_gain=s.moment_gain * g,
-                rest_curvature=s.rest_curvature + r / s.length,
-                friction_moment=s.friction_moment * f,
-            )
-            for s, g, r, f in segments
-        ),
+        moment_gain=[s.moment_gain * g for s, g in zip(limb.segments, gain, strict=True)],
+        rest_curvature=[
+            s.rest_curvature + r / s.length for s, r in zip(limb.segments, rest, strict=True)
+        ],
+        friction_moment=[
+            s.friction_moment * f for s, f in zip(limb.segments, friction, strict=True)
+        ],
     )
 
 

@@ -21,12 +21,9 @@ STIFFER = np.array([1.4, 0.7])
 
 def resting(gravity: tuple[float, float, float], mass: float) -> np.ndarray:
     """Return the bend (2,) [rad] of a limb of other stiffness that rests with a mass [kg]."""
-    segments = tuple(
-        replace(s, bending_stiffness=factor * s.bending_stiffness)
-        for s, factor in zip(LIMB.segments, STIFFER, strict=True)
-    )
-    masses = (PointMass(AT, mass),)
-    model = RodModel(replace(LIMB, segments=segments, gravity=gravity, masses=masses), 41)
+    usual = LIMB.segments[0].bending_stiffness
+    stiffer = with_segments(LIMB, bending_stiffness=list(STIFFER * usual))
+    model = RodModel(replace(stiffer, gravity=gravity, masses=(PointMass(AT, mass),)), 41)
     return model.bend_of(model.resting(np.zeros(2)))
 
 

@@ -97,18 +97,14 @@ def test_the_bend_at_rest_changes_as_the_difference_of_two(name, mounting):
 
 def test_coupling_adds_the_share_of_the_neighbours_pressure():
     limb = Limb.default()
-    first, second = limb.segments
-    coupled = replace(
-        limb,
-        segments=(replace(first, coupling_after=0.04), replace(second, coupling_before=-0.02)),
-    )
+    coupled = with_segments(limb, coupling_after=[0.04, 0.0], coupling_before=[0.0, -0.02])
     found = felt(coupled, WANTED, BEND)
     expected = WANTED + WANTED[:, ::-1] * [0.04, -0.02]
     np.testing.assert_allclose(found, expected, rtol=1e-12)
-    alone = replace(limb, segments=(replace(first, coupling_before=0.04), second))
+    alone = with_segments(limb, coupling_before=[0.04, 0.0])
     np.testing.assert_array_equal(felt(alone, WANTED, BEND), WANTED)
     with pytest.raises(LimbError, match="coupling_after"):
-        replace(limb, segments=(replace(first, coupling_after=0.6), second))
+        with_segments(limb, coupling_after=[0.6, 0.0])
 
 
 def test_too_much_stiffening_is_refused_by_its_name():

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from limbs import with_segments
+from limbs import with_air, with_segments
 
 from der_planner.limb import VENT_REFERENCE, Limb
 from der_planner.model import CONTROL_PERIOD, STEPS, Initial, Material, Model, RodModel, simulate
@@ -16,33 +16,23 @@ from der_planner.model.bending import bend_angles
 
 
 def everything() -> Limb:
-    limb = Limb.default()
-    shares = ((0.05, 0.3, 0.03), (-0.04, -0.2, -0.02))
-    segments = tuple(
-        replace(
-            s,
-            gain_asymmetry=asymmetry,
-            pressure_stiffening=4e-6,
-            rest_curvature=rest,
-            cubic_stiffness=0.06 * s.bending_stiffness * s.length**2,
-            material_damping=0.01,
-            friction_moment=400 * s.moment_gain,
-            friction_curvature=0.12 / s.length,
-            creep_stiffness=500 * s.moment_gain * s.length,
-            creep_time=8.0,
-            coupling_before=coupling,
-            coupling_after=-coupling,
-        )
-        for s, (asymmetry, rest, coupling) in zip(limb.segments, shares, strict=True)
+    limb = with_air(
+        Limb.default(), time_constant=0.3, vent_time_constant=0.13, delay=0.03, vent_rate=5300.0
     )
-    air = replace(
-        limb.pneumatics,
-        time_constant=0.3,
-        vent_time_constant=0.13,
-        delay=0.03,
-        vent_rate=5300.0,
+    return with_segments(
+        limb,
+        gain_asymmetry=[0.05, -0.04],
+        pressure_stiffening=4e-6,
+        rest_curvature=[0.3, -0.2],
+        cubic_stiffness=lambda s: 0.06 * s.bending_stiffness * s.length**2,
+        material_damping=0.01,
+        friction_moment=lambda s: 400 * s.moment_gain,
+        friction_curvature=lambda s: 0.12 / s.length,
+        creep_stiffness=lambda s: 500 * s.moment_gain * s.length,
+        creep_time=8.0,
+        coupling_before=[0.03, -0.02],
+        coupling_after=[-0.03, 0.02],
     )
-    return replace(limb, segments=segments, pneumatics=air)
 
 
 LIMB = everything()

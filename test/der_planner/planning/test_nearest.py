@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from limbs import with_segments
 
 from der_planner.limb import Limb
 from der_planner.model import ArcModel, RodModel
@@ -104,15 +105,11 @@ def test_the_plan_says_how_far_it_is_from_the_drawing(model):
 
 def uneven_limb(random):
     """Return the limb as a calibration may find it: segments of other gains, bent at rest."""
-    segments = (
-        replace(
-            each,
-            moment_gain=each.moment_gain * random.uniform(0.8, 1.4),
-            rest_curvature=random.normal(0.0, 0.4),
-        )
-        for each in LIMB.segments
+    return with_segments(
+        LIMB,
+        moment_gain=lambda s: s.moment_gain * random.uniform(0.8, 1.4),
+        rest_curvature=lambda _: random.normal(0.0, 0.4),
     )
-    return replace(LIMB, segments=tuple(segments))
 
 
 def scrawl(random):

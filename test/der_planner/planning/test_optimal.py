@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from limbs import with_air
 from scipy.optimize import linprog
 
 from der_planner.limb import Limb
@@ -59,8 +60,8 @@ def test_windows_agree_with_one_window():
 @pytest.mark.parametrize(("name", "period"), [("asynchronous", 6.0), ("opposite_direction", 3.0)])
 def test_the_optimum_is_found_in_few_steps_whatever_the_dead_time(name, period):
     """The linearisation must know the delay: without, the plan takes 12 steps and misses more."""
-    air = replace(LIMB.pneumatics, slew_limit=1e6, pressure_limit=1e5, delay=0.12)
-    solver = solver_for(replace(LIMB, pneumatics=air), Motion.named(name, 0.6, period, 1))
+    limb = with_air(LIMB, slew_limit=1e6, pressure_limit=1e5, delay=0.12)
+    solver = solver_for(limb, Motion.named(name, 0.6, period, 1))
     found = solver.run()
     assert found.steps <= 4
     assert np.linalg.norm(found.tip[1:] - solver.target[:-1], axis=1).mean() < 3e-5

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from limbs import with_air, with_segments
 
 from der_planner.limb import CalibratedRange, Limb
 from der_planner.model import RodModel
@@ -23,35 +24,22 @@ CASES = ("asynchronous", "same_direction", "opposite_direction")
 EVERY = [(model, method) for model, methods in METHODS.items() for method in methods]
 
 
-def changed(limb, air=None, segment=None):
-    segments = tuple(
-        dataclasses.replace(s, **{k: v[i] for k, v in (segment or {}).items()})
-        for i, s in enumerate(limb.segments)
-    )
-    return dataclasses.replace(
-        limb, segments=segments, pneumatics=dataclasses.replace(limb.pneumatics, **(air or {}))
-    )
-
-
-UNEVEN = changed(
-    LIMB,
-    {"delay": 0.03, "vent_time_constant": 0.2},
-    {
-        "length": (0.115, 0.129),
-        "bending_stiffness": (0.0175, 0.019),
-        "rest_curvature": (0.2, -0.1),
-        "cubic_stiffness": (4e-6, 0.0),
-        "material_damping": (0.02, 0.01),
-        "moment_gain": (9.1e-6, 8.2e-6),
-        "gain_asymmetry": (0.05, -0.04),
-        "pressure_stiffening": (2e-6, 1e-6),
-        "friction_moment": (4e-3, 0.0),
-        "friction_curvature": (0.3, 0.0),
-        "creep_stiffness": (1e-3, 0.0),
-        "creep_time": (8.0, 0.0),
-    },
+UNEVEN = with_segments(
+    with_air(LIMB, delay=0.03, vent_time_constant=0.2),
+    length=[0.115, 0.129],
+    bending_stiffness=[0.0175, 0.019],
+    rest_curvature=[0.2, -0.1],
+    cubic_stiffness=[4e-6, 0.0],
+    material_damping=[0.02, 0.01],
+    moment_gain=[9.1e-6, 8.2e-6],
+    gain_asymmetry=[0.05, -0.04],
+    pressure_stiffening=[2e-6, 1e-6],
+    friction_moment=[4e-3, 0.0],
+    friction_curvature=[0.3, 0.0],
+    creep_stiffness=[1e-3, 0.0],
+    creep_time=[8.0, 0.0],
 )
-FREE = changed(LIMB, {"slew_limit": 1e6, "pressure_limit": 1e5})
+FREE = with_air(LIMB, slew_limit=1e6, pressure_limit=1e5)
 
 
 @pytest.fixture(scope="module")
@@ -136,7 +124,7 @@ def test_a_calibrated_limb_with_every_effect_is_followed(model_name, method):
 @pytest.mark.parametrize(("model_name", "method"), EVERY)
 @pytest.mark.parametrize("name", ["same_direction", "star"])
 def test_limits_are_never_violated(model_name, method, name):
-    limb = changed(LIMB, {"slew_limit": 7000.0, "pressure_limit": 21e3})
+    limb = with_air(LIMB, slew_limit=7000.0, pressure_limit=21e3)
     result = plan(limb, Motion.named(name, period=3.0, cycles=1), model_name, method)
     steps = np.diff(result.differential_pressure, axis=0, prepend=0.0)
     assert np.abs(result.differential_pressure).max() <= 21e3 + 1e-6
