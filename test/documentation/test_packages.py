@@ -1,10 +1,13 @@
-"""Packages depend on what rosdep knows; a node that lacks an extra names it."""
+"""Packages have one version and dependencies that rosdep knows; a missing extra is named."""
 
+import importlib.metadata
+import re
 import sys
 from xml.etree import ElementTree
 
 import pytest
 
+import set_version
 from limb_interfaces.entry import run_module
 from workspace_setup.basics import PACKAGES, ROOT
 
@@ -44,3 +47,18 @@ def test_a_node_without_an_extra_names_it(monkeypatch, capsys, tmp_path):
     monkeypatch.setattr("limb_interfaces.entry.on_end_signals", lambda _: None)
     assert run_module("lonely") == 1
     assert "pip install nicegui" in capsys.readouterr().err
+
+
+def test_every_package_has_the_version_of_the_project_also_where_it_is_installed():
+    stated = set_version.versions()
+    assert len(stated) == 5
+    packages = [path.parent.name for path in ROOT.glob("src/*/setup.py")]
+    assert len(packages) == 3
+    installed = [importlib.metadata.version(package) for package in packages]
+    assert {*stated.values(), *installed} == {stated["pyproject.toml"]}
+
+
+def test_the_change_log_names_the_version():
+    text = (ROOT / "CHANGELOG.md").read_text()
+    released = re.findall(r"^## (\d+\.\d+\.\d+)", text, flags=re.MULTILINE)
+    assert released[0] == set_version.versions()["pyproject.toml"]

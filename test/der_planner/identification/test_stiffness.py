@@ -1,15 +1,17 @@
-"""A known weight on the resting limb tells its stiffness, whatever friction does."""
+"""Stiffness from a known weight on the resting limb, whatever friction does, and from motion."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from limbs import with_segments
+from link_chain import LinkChain
 
 from der_planner.identification import CalibrationLog, LogError
-from der_planner.identification.log import Prepared
+from der_planner.identification.excitation import calibration_run
+from der_planner.identification.log import Prepared, prepare
 from der_planner.identification.report import Unknown
-from der_planner.identification.stiffness import HungWeight
+from der_planner.identification.stiffness import HungWeight, stiffness_in_motion
 from der_planner.identification.told import against_motion
 from der_planner.limb import Limb, PointMass
 from der_planner.model import RodModel
@@ -92,3 +94,15 @@ def test_a_weight_that_contradicts_the_motion_is_named():
     assert "stiffness[0] is 2.00 times" in said[0]
     assert not list(against_motion(moved, np.log([1.3, 0.5]), np.array([0.1, 0.1])))
     assert not list(against_motion(moved, np.array([2.0, 2.0]), np.full(2, np.inf)))
+
+
+def test_stiffness_is_found_though_friction_stops_each_swing():
+    run, chain = calibration_run(16_800.0), LinkChain(1)
+    log = chain.play(run.time, run.differential_pressure, run=1, noise=3.0).log()
+    compliance = np.sum(1.0 / chain._stiffness.reshape(2, -1), axis=1)
+    true = np.log(
+        [s.length / c / s.bending_stiffness for s, c in zip(LIMB.segments, compliance, strict=True)]
+    )
+    change, deviation = stiffness_in_motion(LIMB, prepare(log, LIMB))
+    assert deviation.max() < 0.1
+    assert np.abs(change - true).max() < 0.12
