@@ -152,6 +152,22 @@ def test_a_gap_is_bridged_for_a_few_usual_frames_while_the_tip_is_known(plain, l
     assert "no limb tag in the image" in found.reason
 
 
+def test_a_bridge_grows_unsure_and_is_given_up(plain):
+    follower = LimbFollower(plain, FollowerOptions(bridge_frames=3))
+    for k, bend in enumerate((0.4, 0.41, 0.42)):
+        shape = constant_curvature(plain.segment_lengths, [bend, bend])
+        known = follower.follow(seen(plain, shape), 0.03 * k).estimate
+    bridged = [follower.follow([], 0.03 * k) for k in range(3, 7)]
+    spreads = [
+        np.trace(each.tip_covariance) for each in (known, *(b.estimate for b in bridged[:3]))
+    ]
+    assert np.all(np.diff(spreads) > 0.0)
+    assert bridged[2].reason.startswith("bridged 3 frames")
+    assert np.hypot(*(bridged[0].estimate.tip - shape.points[-1])) < 0.01
+    assert bridged[3].estimate is None
+    assert follower.follow(seen(plain, shape), 0.3).estimate is not None
+
+
 def test_what_cannot_be_the_limb_of_the_map_is_refused_with_the_remedy(plain):
     placed = seen(plain, constant_curvature(plain.segment_lengths, [0.1, 0.2]))
     small = [dataclasses.replace(tag, pose=tag.pose * [1e-3, 1e-3, 1.0]) for tag in placed]
