@@ -116,19 +116,6 @@ def test_a_planar_problem_moves_the_same_in_space(method, tau):
     np.testing.assert_allclose(a.v, b.v, atol=2e-7)
 
 
-def test_step_by_step_is_the_same_as_a_simulation():
-    rod = Rod.from_limb(Limb.default())
-    u = 1e4 * np.sin(np.arange(20)[:, None] + [0.0, 1.0])
-    run = rod.simulate(rod.straight_state(), u, 0.02)
-    state = rod.straight_state()
-    for row in u:
-        state = rod.step(state, row, 0.02)
-    np.testing.assert_allclose(run.final.q, state.q, atol=1e-10)
-    np.testing.assert_allclose(run.q[-1], run.final.q)
-    assert run.positions.shape == (21, 21, 3)
-    np.testing.assert_array_equal(run.positions[-1], rod.positions(run.final))
-
-
 COMMON = {"length": 0.2, "nodes": 7, "EI": 0.02, "EA": 60.0, "GJ": 0.013, "mass_per_length": 1.0}
 
 

@@ -12,25 +12,6 @@ from der_planner.model.bending import PolylineKinematics, bend_angles
 from der_planner.rod import ConvergenceError, Rod
 
 
-@pytest.mark.parametrize("plane", ["xy", None])
-@pytest.mark.parametrize("turns", [1.0, 2.0])
-def test_an_end_moment_rolls_the_rod_to_a_circle(plane, turns):
-    nodes = 41
-    rod = Rod.uniform(
-        length=0.25, nodes=nodes, EI=0.02, EA=1000.0, GJ=0.02, mass_per_length=1.0,
-        segments=[(0, nodes)], moment_gain=[1.0], plane=plane,
-    )  # fmt: skip
-    step = rod.rest_lengths[0]
-    turn = 2 * np.pi * turns / (nodes - 2)
-    moment = 0.02 / step * 2 * np.tan(turn / 2) * (1 + np.tan(turn / 2) ** 2)
-    state = rod.equilibrium([moment / step / rod.input_gain[0]])
-    edges = np.diff(state.positions @ [1.0, 1j, 0.0])
-    np.testing.assert_allclose(np.angle(edges[1:] / edges[:-1]), turn, atol=1e-9)
-    # The continuum's angle G u L / EI differs by the second order in the turning of a node
-    continuum = moment * (nodes - 2) * step / 0.02
-    assert continuum == pytest.approx(2 * np.pi * turns, rel=turn**2)
-
-
 def test_a_rod_curved_and_twisted_at_rest_is_a_helix():
     curvature, twist, length = 10.0, 15.0, 0.5
     error = []
