@@ -1,4 +1,4 @@
-"""`simulate`: values against laws written out here, derivatives against finite differences.
+"""`simulate`: values against the laws of air and material, derivatives against finite differences.
 
 Every term of air and material is on: a friction that turns round over a bend 10 % off, or a lag
 that is forgotten, breaks these tests.
@@ -63,34 +63,15 @@ def integrated_chambers(commands):
     return result
 
 
-def felt(differential, time, angles):
-    """The material's law, instant by instant, as its page writes it."""
-    result = np.empty_like(differential)
-    z, q = np.zeros(2), np.zeros(2)
-    for k in range(len(time)):
-        for i, s in enumerate(LIMB.segments):
-            if k:
-                turned = angles[k, i] - angles[k - 1, i]
-                side = 1.0 if turned >= 0 else -1.0
-                fade = np.exp(-abs(turned) / (s.friction_curvature * s.length))
-                z[i] = side - (side - z[i]) * fade
-                elapsed = (time[k] - time[k - 1]) / s.creep_time
-                filled = (1 - np.exp(-elapsed)) / elapsed
-                q[i] = q[i] * np.exp(-elapsed) + turned / s.length * filled
-            own, other = differential[k, i], differential[k, 1 - i]
-            share = s.coupling_after if i == 0 else s.coupling_before
-            driven = own * (1 + s.gain_asymmetry * np.sign(own)) + share * other
-            held = (s.friction_moment * z[i] + s.creep_stiffness * q[i]) / s.moment_gain
-            result[k, i] = (driven - held) / (1 + s.pressure_stiffening * abs(own))
-    return result
-
-
 def test_commands_become_pressures_and_shape_by_the_laws():
     response = simulate(LIMB, TIME, commands=COMMANDS, bend=bend)
     differential = response.differential_pressure.reshape(-1, 2)
     assert np.abs(differential - integrated_chambers(COMMANDS)).max() < 25.0
     middle = (np.arange(COUNT * STEPS) + 0.5) * 0.01
-    effective = felt(differential, middle, bend(middle))
+    material = Material(LIMB)
+    effective = material.without_memory(
+        differential, material.memory_pressures(middle, bend(middle))
+    )
     np.testing.assert_allclose(response.effective_pressure.reshape(-1, 2), effective, atol=1e-7)
     model = RodModel(LIMB)
     moved = model.rod.simulate(
