@@ -1,4 +1,4 @@
-"""What people write into a motion command, and what the page says that the planner makes of it."""
+"""What people ask of the page, what it says that came of it, and the guide that sets a rig up."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ from typing import Any
 import pytest
 from statuses import status
 
-from der_msgs.msg import MotionCommand
+from der_msgs.msg import LimbState, MotionCommand, PressureState
 from der_planner.page import commands
 from der_planner.page.commands import Answer, Commands
 from der_planner.page.forms import FormError, read_mounting, read_number
+from der_planner.page.setup_guide import SetupGuide, Step
 from der_planner.page.situation import Situation
 
 
@@ -83,3 +84,110 @@ def test_mountings_are_names_or_degrees() -> None:
     assert float(read_mounting("12,5°")) == 12.5
     with pytest.raises(FormError, match="upside down"):
         read_mounting("upside down")
+
+
+VENTED = (12.0, -40.0)
+"""Differential pressures [Pa] of a limb that is vented, as its sensors have it."""
+
+
+class GuidedSetup:
+    """What the page hears, and the guide's steps."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+        self.situation = Situation(lambda: self.now)
+        self.guide = SetupGuide(2)
+
+    def drive(self, pressures: tuple[float, ...], telemetry_age: float = 0.05, **what: Any) -> None:
+        """Let the driver say what it does and measures [Pa]."""
+        message = PressureState(measured_differential=pressures, telemetry_age=telemetry_age)
+        for name, value in what.items():
+            setattr(message, name, value)
+        self.situation.put_driver(message)
+
+    def plan_for(self, limb: str, identified: str) -> None:
+        """Let the planner say for which limb it plans, and when that was identified."""
+        self.situation.put_status(status("/limb/planner", limb=limb, limb_identified=identified))
+
+    def steps(self, problem: str = "", calibrated: bool = True) -> list[Step]:
+        return self.guide.steps(self.situation.snapshot(), problem, calibrated)
+
+    def done(self) -> list[bool]:
+        return [step.done for step in self.steps()]
+
+
+def test_nothing_is_done_before_anything_is_heard() -> None:
+    steps = GuidedSetup().steps("no calibration yet", calibrated=False)
+    assert not any(step.done for step in steps)
+    assert all(step.seen and step.advice for step in steps)
+
+
+def test_a_running_rig_passes_until_it_falls_silent() -> None:
+    rig = GuidedSetup()
+    rig.drive(VENTED)
+    rig.situation.put_limb(LimbState(valid=True))
+    rig.plan_for("a name", "2026-02-01, bags/run")
+    assert rig.done() == [True, True, False, True, True, True, False, True, True]
+    rig.now = 6.0
+    assert rig.done() == [False, False, False, True, True, False, False, False, False]
+
+
+def test_each_chamber_counts_only_if_it_is_driven_alone() -> None:
+    rig = GuidedSetup()
+    for measured in ((5e3, 5e3), (2e3, 0.0), (float("nan"), 5e3)):
+        rig.drive(measured, mode=2)
+        rig.steps()
+    assert "segment 0 left" in rig.steps()[2].seen
+    assert "segment 1 left" not in rig.steps()[2].seen
+    for measured in ((5e3, 0.0), (-5e3, 200.0), (0.0, -4e3)):
+        rig.drive(measured, mode=2)
+        rig.steps()
+    assert rig.steps()[2].done
+
+
+@pytest.mark.parametrize("limit", [4e3, 250e3])
+def test_chambers_of_other_limbs_count_at_the_same_share_of_the_drivers_limit(limit: float) -> None:
+    rig = GuidedSetup()
+    rig.situation.put_status(status("/limb/pressure_driver", pressure_limit_pa=f"{limit:g}"))
+    rig.drive((0.04 * limit, 0.0))
+    assert rig.steps()[1].done
+    for measured in ((0.12, 0.0), (0.2, 0.05), (-0.13, 0.0), (0.0, 0.2)):
+        rig.drive(tuple(share * limit for share in measured), mode=2)
+        rig.steps()
+    seen = rig.steps()[2].seen
+    assert "segment 0 left" in seen
+    assert "segment 1 right" in seen
+    assert "segment 0 right" not in seen
+    assert "segment 1 left" not in seen
+
+
+def test_pressure_that_stays_and_a_limb_that_nobody_identified_are_no_success() -> None:
+    rig = GuidedSetup()
+    rig.drive((1500.0, 0.0))
+    rig.plan_for("our limb", "")
+    steps = rig.steps()
+    assert not steps[1].done
+    assert "1.50 kPa" in steps[1].seen
+    assert not steps[7].done
+    assert not steps[8].done
+    rig.drive(VENTED, mode=1)
+    assert not rig.steps()[1].done
+    rig.drive(VENTED, telemetry_age=float("nan"))
+    assert "never been heard" in rig.steps()[0].seen
+
+
+@pytest.mark.parametrize(("plan", "step"), [("check-12ab", 6), ("calibration-12ab34cd", 7)])
+def test_a_run_is_seen_while_and_after_it_is_played(plan: str, step: int) -> None:
+    rig = GuidedSetup()
+    rig.drive(VENTED, mode=2, plan_id=plan)
+    assert (rig.steps()[step].done, rig.steps()[step].seen) == (False, "one is being played")
+    rig.drive(VENTED)
+    assert rig.steps()[step].done
+
+
+def test_with_motion_capture_no_camera_is_asked_for() -> None:
+    rig = GuidedSetup()
+    rig.situation.put_status(status("/limb/pose_tracker"))
+    steps = rig.steps("no calibration yet", calibrated=False)
+    assert [step.done for step in steps[3:6]] == [True, True, False]
+    assert "motion capture" in steps[3].seen
