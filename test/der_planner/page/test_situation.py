@@ -23,6 +23,16 @@ from limb_interfaces.diagnostics import ENDED_IN_ORDER, TOUCHED
 from limb_interfaces.stamps import stamp_from_nanoseconds
 
 
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def situation(clock: Clock) -> Situation:
+    return Situation(clock)
+
+
 def driver(mode: int = 5, age: float = 0.1) -> PressureState:
     nan = float("nan")
     return PressureState(
