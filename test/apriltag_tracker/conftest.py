@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,12 @@ def config() -> Path:
 @pytest.fixture(scope="session")
 def tags() -> TagMap:
     return TagMap.from_yaml(CONFIG / "tags.yaml")
+
+
+@pytest.fixture(scope="session")
+def plain(tags: TagMap) -> TagMap:
+    """The default tags on a limb without stiff stretches, on which arcs are exact."""
+    return dataclasses.replace(tags, stiff=())
 
 
 @pytest.fixture(scope="session")
