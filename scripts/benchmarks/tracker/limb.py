@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 from apriltag_tracker.detection import Detector
 from apriltag_tracker.pipeline import LimbTracker
 from apriltag_tracker.synthetic.camera import CameraModel, Optics, SyntheticCamera
-from apriltag_tracker.synthetic.shapes import Shape, constant_curvature
 from apriltag_tracker.tag_map import TagMap
 from benchmarks import show
+from benchmarks.tracker import Swing
 from benchmarks.tracker.renderer import Scene, render
 from der_msgs.msg import ChamberPressures, LimbState
 from der_planner.experiment.client import GraphClient
@@ -142,23 +142,16 @@ def measure_false_tags(count: int) -> dict[str, float]:
     return {"random_pictures": float(count), "false_tags_in_random_pictures": float(false)}
 
 
-def swing(tags: TagMap, moment: float) -> Shape:
-    """Return the limb at a moment [s]: each segment swings at its own period."""
-    bends = 0.8 * np.sin(2.0 * np.pi * moment / np.array([3.0, 4.0]))
-    return constant_curvature(tags.segment_lengths, bends.tolist())
-
-
 def measure_swing(frames: int, exposure: float) -> dict[str, float]:
     """Follow a swinging limb."""
     tags = dataclasses.replace(TagMap.from_yaml(CONFIG / "tags.yaml"), stiff=())
     model = CameraModel.from_yaml(CONFIG / "synthetic_camera.yaml")
     camera = SyntheticCamera(model, tags, Optics(exposure=exposure))
-    tracker = LimbTracker(tags, model.intrinsics)
+    tracker, swing = LimbTracker(tags, model.intrinsics), Swing(tags)
     times, gaps, nees, corners, asked = [], [], [], [], 0
     for k in range(frames):
-        shape, later = swing(tags, k * PERIOD), swing(tags, k * PERIOD + 1e-3)
-        points, heading = later.points - shape.points, later.heading - shape.heading
-        frame = camera.frame(shape, Shape(shape.arc_length, 1e3 * points, 1e3 * heading))
+        shape = swing.shape(k * PERIOD)
+        frame = camera.frame(shape, swing.velocity(k * PERIOD))
         begin = time.process_time()
         observation = tracker.observe(frame.image, k * PERIOD)
         times.append(1e3 * (time.process_time() - begin))
