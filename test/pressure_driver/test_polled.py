@@ -1,12 +1,12 @@
 """Boards that are asked: how a terminal is started, its registers, and coarse sensors."""
 
 import asyncio
-import socket
 import struct
 import threading
 
 import numpy as np
 import pytest
+from domain import free_port
 from pymodbus.client import ModbusTcpClient
 from pymodbus.server import ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
@@ -167,8 +167,7 @@ def plain_server():
         SimData(40003, values=[0] * 6, datatype=DataType.REGISTERS),
         SimData(45395, values=said, datatype=DataType.REGISTERS, readonly=True),
     ]
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        address = free.getsockname()
+    address = ("127.0.0.1", free_port())
     loop = asyncio.new_event_loop()
     server = None
 

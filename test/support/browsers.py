@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import socket
 from typing import Any
 
 import psutil
 import pytest
+from domain import free_port
 
 from benchmarks.browser import CHROMEDRIVER, CHROMIUM
 
@@ -20,9 +20,7 @@ TOKEN = "token-of-the-tests"
 
 def start_page(graph: Any, **parameters: object) -> tuple[Any, str]:
     """Start the page at a free port; return its process and the address that opens it."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = free_port()
     page = graph.start("der_planner", "page", port=port, token=TOKEN, **parameters)
     return page, f"http://127.0.0.1:{port}/?token={TOKEN}"
 
