@@ -67,6 +67,17 @@ def shared_data() -> Path:
     return folder
 
 
+@pytest.fixture
+def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Any:
+    """Return what calls a command and returns its exit code, and what it said on both outputs."""
+
+    def called(command: Any, *arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", [command.__name__, *map(str, arguments)])
+        return command.main(), *capsys.readouterr()
+
+    return called
+
+
 class Graph:
     """Starts nodes in the domain of a test file and talks to them.
 

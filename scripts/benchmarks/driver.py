@@ -1,8 +1,7 @@
-"""How punctual the pressure driver is, seen from the board: quiet, busy, in the whole graph."""
+"""How punctual the pressure driver is, seen from the board: in quiet, and in a storm."""
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import os
 import subprocess
@@ -10,7 +9,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -18,17 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 from std_srvs.srv import Trigger
 
-from der_msgs.msg import (
-    ChamberPressures,
-    MotionCommand,
-    PressurePlan,
-    PressureSetpoint,
-    PressureState,
-)
+from benchmarks import show
+from der_msgs.msg import ChamberPressures, PressureSetpoint, PressureState
 from der_planner.experiment.client import GraphClient
 from der_planner.experiment.console import Progress
 from der_planner.experiment.graph_run import RunningGraph
-from der_planner.experiment.processes import GraphSetup, Hardware, NodeSpec
+from der_planner.experiment.processes import GraphSetup, NodeSpec
 from limb_interfaces import qos, topics
 from limb_interfaces.stamps import nanoseconds, stamp_from_nanoseconds
 
@@ -62,13 +56,6 @@ class Rig:
 
 Setpoints = dict[int, tuple[float, ...]]
 """Stamp [ns] -> differential pressures [Pa]."""
-
-
-def _nodes(case: str, folder: Path) -> list[NodeSpec]:
-    driver = {"real_time_priority": 0} if case == "ordinary" else {}
-    setup = GraphSetup(folder / "bag", {}, hardware=Hardware(driver, twin={}), planner={})
-    # The first two are board and driver.
-    return setup.nodes(str(folder / "board"))[: None if case == "graph" else 2]
 
 
 NODE = """
@@ -172,26 +159,6 @@ def _stream(client: GraphClient, seconds: float) -> Setpoints:
     return wanted
 
 
-def play_plan(client: GraphClient, seconds: float) -> Setpoints:
-    """Have the planner plan and play a motion of at least this length."""
-    client.subscribe(PressurePlan, topics.PLAN, qos.LATCHED)
-    client.call("recorder/start", 20.0)
-    publisher = client.node.create_publisher(MotionCommand, topics.COMMAND, qos.COMMANDS)
-    client.wait_for(publisher.get_subscription_count, 20.0, "the planner to listen")
-    cycles = int(np.ceil(seconds / 20.0))
-    publisher.publish(
-        MotionCommand(
-            motion="same_direction", model="der", period=20.0, cycles=cycles, plan_id="benchmark"
-        )
-    )
-    plan = client.wait_for(lambda: client.newest.get(topics.PLAN), 180.0, "the plan")
-    start = nanoseconds(plan.header.stamp)
-    values = np.reshape(plan.differential_pressure, (len(plan.time), -1))
-    stamps = [start + round(t * 1e9) for t in plan.time]
-    client.wait_for(lambda: time.time_ns() > stamps[-1] + 500_000_000, 300.0, "the motion's end")
-    return {stamp: tuple(row) for stamp, row in zip(stamps, values.tolist(), strict=True)}
-
-
 @dataclass
 class Samples:
     """What one playing of a case has shown; times in s."""
@@ -255,19 +222,18 @@ def _percentiles(name: str, values: NDArray[np.float64]) -> dict[str, float | st
     }
 
 
-def _measure(case: str, seconds: float, presses: int = 0) -> Samples:
-    """Start the nodes of a case, play, and return what was seen."""
-    play: Callable[[GraphClient, float], Setpoints] = play_plan if case == "graph" else _stream
+def _measure(case: str, seconds: float, presses: int) -> Samples:
+    """Play setpoints to an emulated board and return what was seen."""
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="der_limb_driver_")))
-        rig = Rig(stack, _nodes(case, folder), folder)
+        board_and_driver = GraphSetup(folder / "bag", {}).nodes(str(folder / "board"))[:2]
+        rig = Rig(stack, board_and_driver, folder)
         client = rig.client
         client.call("pressure_driver/arm")
-        busy = 0 if case in ("quiet", "graph") else os.cpu_count() or 1
-        stack.enter_context(busy_loops(busy))
         if case == "storm":
+            stack.enter_context(busy_loops(os.cpu_count() or 1))
             stack.enter_context(_passing_nodes())
-        wanted = play(client, seconds)
+        wanted = _stream(client, seconds)
         samples = _compare(wanted, rig)
         client.spin(1.1)
         told = client.diagnostic_values("pressure_driver")
@@ -278,46 +244,26 @@ def _measure(case: str, seconds: float, presses: int = 0) -> Samples:
         samples.lost = int(bool(lost))
         if lost:
             print(f"driver: vented: {'; '.join(lost[0].faults)}", file=sys.stderr)
-        if case == "storm" and presses:
+        if case == "storm":
             client.call("pressure_driver/vent", 20.0)
             samples.presses = _press(rig, presses)
         return samples
 
 
 CASES = {
-    "quiet": "driver and board",
-    "busy": "driver and board, every core busy with another process",
-    "ordinary": "the same without real-time priority for the driver",
-    "storm": "every core busy, and a node a second appearing",
-    "graph": "driver, board and planner, twin, camera, tracker, recorder",
+    "quiet": (3, "driver and board"),
+    "storm": (8, "every core busy, and a node a second appearing"),
 }
-
-
-def measure(case: str, runs: int, seconds: float, presses: int) -> dict[str, float | str]:
-    """Measure one case, print its figures and return them."""
-    print(f"driver: {CASES[case]}, {runs} x {seconds:.0f} s …", file=sys.stderr, flush=True)
-    played = [_measure(case, seconds, presses // runs) for _ in range(runs)]
-    figures = _figures(case, played)
-    print(f"\n{CASES[case]}")
-    for key, value in figures.items():
-        shown = f"{value:10.3f}" if isinstance(value, float) else f"{value:>10}"
-        print(f"  {key.removeprefix(case + '_').replace('_', ' '):45s} {shown}")
-    return figures
+"""How often each is played, and what it is."""
 
 
 def run(quick: bool) -> dict[str, float | str]:
-    """Measure all cases; ``quick`` takes 10 s each instead of 60."""
+    """Measure both cases; ``quick`` plays each once for 10 s in place of several minutes."""
     figures: dict[str, float | str] = {}
-    for case in CASES:
-        figures |= measure(case, 1, 10.0 if quick else 60.0, 20 if quick else PRESSES)
+    for case, (usual, what) in CASES.items():
+        runs, seconds, presses = (1, 10.0, 20) if quick else (usual, 60.0, PRESSES)
+        print(f"driver: {what}, {runs} x {seconds:.0f} s …", file=sys.stderr, flush=True)
+        found = _figures(case, [_measure(case, seconds, presses // runs) for _ in range(runs)])
+        show(found)
+        figures |= found
     return figures
-
-
-if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("case", choices=CASES)
-    parser.add_argument("--runs", type=int, default=6)
-    parser.add_argument("--seconds", type=float, default=60.0)
-    parser.add_argument("--presses", type=int, default=PRESSES)
-    given = parser.parse_args()
-    measure(given.case, given.runs, given.seconds, given.presses)

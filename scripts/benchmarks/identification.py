@@ -11,6 +11,7 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks import show
 from der_planner.identification import CalibrationLog, FitReport, fit, predict, record_twin
 from der_planner.identification.excitation import PERIOD, Excitation, calibration_run
 from der_planner.identification.terms import GROUPS
@@ -64,18 +65,16 @@ def run(quick: bool) -> Figures:
 
 def _time(log: CalibrationLog, quick: bool) -> Figures:
     figures: Figures = {}
-    print("fit: length of the log [s], processor time [s]")
     for length in (43.0, 86.0) if quick else (50.0, 100.0, 198.0):
         _, _, seconds = _fitted(log.between(0.0, length))
         figures[f"fit_of_{length:.0f}s_log_cpu_s"] = seconds
-        print(f"  {length:6.0f}  {seconds:6.2f}", flush=True)
+    show(figures)
     return figures
 
 
 def _terms(logs: dict[int, CalibrationLog], unseen: dict[int, CalibrationLog]) -> Figures:
+    """Add term by term: bend angle left at the calibration, unseen tip, means of the seeds."""
     figures: Figures = {}
-    print("what each term buys: bend angle left at the calibration, unseen tip, means of the seeds")
-    print(f"  {'terms':24s} fit [deg]  mean [%]  max [%]")
     terms: tuple[str, ...] = ()
     for added in LADDER:
         terms += added
@@ -84,11 +83,9 @@ def _terms(logs: dict[int, CalibrationLog], unseen: dict[int, CalibrationLog]) -
             limb, report, _ = _fitted(log, terms)
             error = 100.0 * _tip_error(limb, unseen[seed])
             rows.append((np.degrees(report.residual).mean(), error.mean(), error.max()))
-        left, mean, largest = np.mean(rows, axis=0)
-        key = "_".join(added) or "linear"
-        figures[f"terms_to_{key}_fit_deg"] = float(left)
-        figures[f"terms_to_{key}_mean_percent"] = float(mean)
-        figures[f"terms_to_{key}_max_percent"] = float(largest)
-        label = "+ " + ", ".join(added) if added else "gain, rest angle"
-        print(f"  {label:24s} {left:9.2f} {mean:9.2f} {largest:8.2f}", flush=True)
+        key = f"terms_to_{'_'.join(added) or 'linear'}"
+        names = (f"{key}_fit_deg", f"{key}_mean_percent", f"{key}_max_percent")
+        found = dict(zip(names, np.mean(rows, axis=0).tolist(), strict=True))
+        show(found)
+        figures |= found
     return figures

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import shutil
 import signal
 import tempfile
 import time
@@ -16,7 +15,8 @@ import numpy as np
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
 
-from benchmarks import cpu_time
+from benchmarks import cpu_time, show
+from benchmarks.browser import CHROMEDRIVER, CHROMIUM, open_browser
 from benchmarks.driver import Rig, busy_loops
 from der_msgs.msg import ChamberPressures, MotionCommand, PressureSetpoint, PressureState
 from der_planner.experiment.processes import PAGE_TOKEN, GraphError, GraphSetup
@@ -35,8 +35,6 @@ ARRIVING = 5.0
 """A press that is not at the board after this time [s] has not arrived."""
 PROGRESS = 20
 """Presses between two lines of progress."""
-FLAGS = ("--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-sync",
-         "--disable-background-networking", "--window-size=1280,800")  # fmt: skip
 LISTEN = """
 window.presses = [];
 const send = window.fetch;
@@ -61,30 +59,17 @@ new MutationObserver(() => {
 """Notes when the window says what it is asked about [ms]."""
 
 
-def open_browser(*flags: str) -> Any:
-    """Start the machine's Chromium, which is seen nowhere, with further flags."""
-    from selenium import webdriver  # noqa: PLC0415 - only tests and this need it
-
-    options = webdriver.ChromeOptions()
-    options.binary_location = shutil.which("chromium")
-    for flag in (*FLAGS, *flags):
-        options.add_argument(flag)
-    service = webdriver.ChromeService(shutil.which("chromedriver"))
-    return webdriver.Chrome(options=options, service=service)
-
-
 class PageGraph(Rig):
     """Board, driver, twin, camera, tracker, planner, recorder and the page, until it is closed.
 
     Args:
-        folder: of logs and profiles.
+        folder: of logs.
         stack: ends nodes and browsers.
         options: of the `GraphSetup`, such as the twin's seed.
     """
 
     def __init__(self, folder: Path, stack: contextlib.ExitStack, **options: Any) -> None:
-        self._folder, self._stack = folder, stack
-        self._windows = 0
+        self._stack = stack
         options = {"metadata": {}, "planner": {}, **options}
         specs = GraphSetup(bag=folder / "bag", page=0, **options).nodes(str(folder / "board"))
         for spec in specs:
@@ -95,8 +80,7 @@ class PageGraph(Rig):
 
     def open_window(self) -> Any:
         """Open the page in a browser of its own, and wait until it shows pictures."""
-        self._windows += 1
-        window = open_browser(f"--user-data-dir={self._folder / f'profile{self._windows}'}")
+        window = open_browser()
         self._stack.callback(window.quit)
         window.get(self.url)
         shown = "return !!page.data && page.pictures > 0"
@@ -240,7 +224,7 @@ def measure_windows(graph: PageGraph, windows: list[Any], seconds: float) -> dic
 
 def run(quick: bool) -> dict[str, float]:
     """Measure vent, alarms, rates and CPU, and print each as it comes; ``quick``: ten presses."""
-    if not (shutil.which("chromium") and shutil.which("chromedriver")):
+    if not (CHROMIUM and CHROMEDRIVER):
         print("page: not measured: sudo apt-get install chromium chromium-driver")
         return {}
     seconds, presses = (5.0, 10) if quick else (15.0, 100)
@@ -248,8 +232,7 @@ def run(quick: bool) -> dict[str, float]:
 
     def take(found: dict[str, float]) -> None:
         figures.update(found)
-        for key, value in found.items():
-            print(f"  {key.replace('_', ' '):60s} {value:10.3f}", flush=True)
+        show(found)
 
     with page_graph() as graph:
         window = graph.open_window()

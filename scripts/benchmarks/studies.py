@@ -1,4 +1,4 @@
-"""What a study costs beside its runs: speed-up, cost of a row, memory of a worker."""
+"""What a study costs beside its runs: speed-up, memory of a worker."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from pathlib import Path
 import psutil
 from distributed import Client, LocalCluster
 
+from benchmarks import show
 from der_planner.experiment.console import Progress
-from der_planner.studies.conduct import PlaySettings, compute, conduct
+from der_planner.studies.conduct import PlaySettings, conduct
 from der_planner.studies.study import Study
 
 Figures = dict[str, float | str]
@@ -37,9 +38,9 @@ def run(quick: bool) -> Figures:
     """Measure and print; return every figure with its unit in the key."""
     figures: Figures = {"load_average_at_start": f"{os.getloadavg()[0]:.2f}"}
     with tempfile.TemporaryDirectory() as folder:
-        figures |= _speed_up(Path(folder), quick) | _tasks(Path(folder), quick)
-    for name, value in figures.items():
-        print(f"  {name:36s} {value if isinstance(value, str) else f'{value:10.2f}'}", flush=True)
+        figures |= _speed_up(Path(folder), quick)
+        figures |= _memory_of_a_worker(Path(folder), quick)
+    show(figures)
     return figures
 
 
@@ -87,24 +88,12 @@ def _speed_up(folder: Path, quick: bool) -> Figures:
     }
 
 
-def _tasks(folder: Path, quick: bool) -> Figures:
-    """Measure what a row costs beside its own work, and the memory of the worker that did it."""
+def _memory_of_a_worker(folder: Path, quick: bool) -> Figures:
+    """Measure the memory of a worker after rows that hardly cost anything themselves."""
     figures: Figures = {}
-    path = folder / "work.yaml"
-    path.write_text(_TASKS.format(count=10))
-    rows = Study.read(path).rows
-    begin = 0.0
-    for place, row in enumerate(rows):
-        if place == 1:  # the first row loads the kernels
-            begin = time.perf_counter()
-        compute("model", row.values, "")
-    work = (time.perf_counter() - begin) / (len(rows) - 1)
     with _cluster(1) as cluster, Client(cluster) as client:
-        address = cluster.scheduler_address
-        _played(_TASKS.format(count=2), folder, address)
         for count in (10, 100) if quick else (10, 100, 1000):
-            wall = _played(_TASKS.format(count=count), folder, address)
-            figures[f"cost_of_each_of_{count}_rows_ms"] = (wall / count - work) * 1e3
+            _played(_TASKS.format(count=count), folder, cluster.scheduler_address)
             figures[f"memory_after_{count}_rows_mb"] = max(client.run(_memory).values())
     return figures
 

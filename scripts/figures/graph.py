@@ -11,6 +11,7 @@ import re
 import tempfile
 from pathlib import Path
 
+from benchmarks.browser import open_browser
 from workspace_setup.basics import ROOT
 
 DRAWING = ROOT / "docs" / "pictures" / "graph.svg"
@@ -38,8 +39,6 @@ def main() -> int:
     """Run the command line."""
     import nicegui  # noqa: PLC0415 - its wheel has Mermaid
     from selenium.webdriver.support.ui import WebDriverWait  # noqa: PLC0415
-
-    from benchmarks.page import open_browser  # noqa: PLC0415 - it needs ROS
 
     dist = Path(nicegui.__file__).parent / "elements" / "mermaid" / "dist" / "index.js"
     with (

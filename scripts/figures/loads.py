@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
 from numpy.typing import NDArray
@@ -20,12 +19,8 @@ from der_planner.rod import RodState
 from der_planner.studies.tasks import Twin, calibrated, limb_of
 from der_planner.twin import LimbTwin
 from der_planner.twin.limb_twin import ATMOSPHERE
-from workspace_setup.basics import ROOT
+from figures.drawing import FOLDER, save
 
-matplotlib.use("Agg")
-
-DPI = 80
-FOLDER = ROOT / "docs" / "pictures"
 MODELS = ("der", "pcc")
 MOUNTINGS = ("hanging", "sideways")
 PAYLOADS = (0.0, 0.05)
@@ -82,8 +77,7 @@ def draw_shapes(path: Path, seed: int) -> None:
         axis.set(title=f"{mounting}, {payload * 1000:.0f} g", xlabel="x [cm]", aspect="equal")
     axes[0].set_ylabel("y [cm]")
     axes[0].legend(fontsize=8)
-    figure.savefig(path, dpi=DPI)
-    plt.close(figure)
+    save(figure, path, 80)
 
 
 def main() -> int:

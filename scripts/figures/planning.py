@@ -9,20 +9,14 @@ import argparse
 import dataclasses
 from pathlib import Path
 
-import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.axes import Axes
 
 from der_planner.limb import Limb
 from der_planner.model import ArcModel
 from der_planner.planning import Motion, Plan, Workspace, plan
-from workspace_setup.basics import ROOT
+from figures.drawing import FOLDER, save
 
-matplotlib.use("Agg")
-
-DPI = 68
-FOLDER = ROOT / "docs" / "pictures"
 CASES = ("asynchronous", "same_direction", "opposite_direction")
 COLORS = {
     ("der", "paper"): "tab:orange",
@@ -57,8 +51,7 @@ def draw_methods(path: Path) -> None:
         row[2].set(xlabel="time [s]", ylabel="predicted error [mm]", ylim=(1e-4, 20))
     axes[0, 0].legend(fontsize=6)
     axes[0, 1].set_title("segment 0 solid, segment 1 dotted", fontsize=8)
-    figure.savefig(path, dpi=DPI)
-    plt.close(figure)
+    save(figure, path, 68)
 
 
 def draw_branches(path: Path) -> None:
@@ -86,8 +79,7 @@ def draw_branches(path: Path) -> None:
     axes.plot(*(point * 100), "k*", ms=10)
     axes.set(xlabel="x [cm]", ylabel="y [cm]", aspect="equal")
     axes.legend(loc="lower left", fontsize=8)
-    figure.savefig(path, dpi=DPI)
-    plt.close(figure)
+    save(figure, path, 68)
 
 
 def draw_limits(path: Path) -> None:
@@ -108,15 +100,10 @@ def draw_limits(path: Path) -> None:
         axes[1].semilogy(
             result.time, np.maximum(result.error * 1000, 1e-3), color=color, lw=1.2, label=label
         )
-    _label(axes[0], "pressure of segment 0 [kPa]")
-    _label(axes[1], "predicted error [mm]")
+    axes[0].set(xlabel="time [s]", ylabel="pressure of segment 0 [kPa]")
+    axes[1].set(xlabel="time [s]", ylabel="predicted error [mm]")
     axes[1].legend(fontsize=7)
-    figure.savefig(path, dpi=DPI)
-    plt.close(figure)
-
-
-def _label(axes: Axes, what: str) -> None:
-    axes.set(xlabel="time [s]", ylabel=what)
+    save(figure, path, 68)
 
 
 def main() -> int:
@@ -130,7 +117,5 @@ def main() -> int:
         ("planning_branches", draw_branches),
         ("planning_limits", draw_limits),
     ):
-        path = options.out / f"{name}.png"
-        draw(path)
-        print(f"{path} ({path.stat().st_size // 1000} kB)")
+        draw(options.out / f"{name}.png")
     return 0

@@ -8,27 +8,15 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
 
 from benchmarks.rod import cantilever, run_elastica
 from der_planner.limb import Limb
 from der_planner.rod import Rod
-from workspace_setup.basics import ROOT
+from figures.drawing import FOLDER, save
 
-matplotlib.use("Agg")
-
-FOLDER = ROOT / "docs" / "pictures"
 ELASTICA_TIP_MM = 66.3753  # exact inextensible elastica: examples/cantilever.py
-
-
-def save(figure: plt.Figure, folder: Path, name: str) -> None:
-    """Write one picture."""
-    figure.tight_layout()
-    figure.savefig(folder / f"rod_{name}.png", dpi=80)
-    plt.close(figure)
-    print(folder / f"rod_{name}.png", flush=True)
 
 
 def statics(folder: Path) -> None:
@@ -58,7 +46,8 @@ def statics(folder: Path) -> None:
     axes[2].set(title="end moment: turns to a circle", xlabel="x [mm]", ylabel="y [mm]")
     axes[2].set_aspect("equal")
     axes[2].legend()
-    save(figure, folder, "statics")
+    figure.tight_layout()
+    save(figure, folder / "rod_statics.png", 80)
 
 
 def dynamics(folder: Path) -> None:
@@ -105,7 +94,8 @@ def dynamics(folder: Path) -> None:
         axes[2].plot(run.time[::20], np.array(values) / values[0], label=method)
     axes[2].set(title="energy, undamped, 1 ms steps", xlabel="time [s]", ylabel="of the start")
     axes[2].legend()
-    save(figure, folder, "dynamics")
+    figure.tight_layout()
+    save(figure, folder / "rod_dynamics.png", 80)
 
 
 def stability(folder: Path) -> None:
@@ -123,7 +113,8 @@ def stability(folder: Path) -> None:
     axis.set(title="default limb, 12.5 ms steps", xlabel="time [s]", ylabel="tip speed [m/s]")
     axis.set_yscale("log")
     axis.legend()
-    save(figure, folder, "stability")
+    figure.tight_layout()
+    save(figure, folder / "rod_stability.png", 80)
 
 
 def main() -> int:

@@ -153,16 +153,14 @@ def test_mounting_without_fixed_tags_names_the_cause(tags, model):
         calibrate_mounting(blank, tags, model.intrinsics)
 
 
-def test_mounting_pictures_of_another_size_are_named_in_one_line(
-    tmp_path, monkeypatch, capsys, model
-):
-    lens, words = tmp_path / "camera.yaml", ["mounting", str(tmp_path)]
+def test_mounting_pictures_of_another_size_are_named_in_one_line(tmp_path, call, model):
+    lens = tmp_path / "camera.yaml"
     model.intrinsics.to_yaml(lens)
     cv2.imwrite(str(tmp_path / "small.png"), np.zeros((480, 640), np.uint8))
-    words += ["--calibration", str(lens), "--out", str(tmp_path / "tags.yaml")]
-    monkeypatch.setattr(sys, "argv", ["calibrate_camera.py", *words])
-    assert calibrate_camera.main() == 1
-    assert "640 x 480 px but the calibration is for 1280 x 720" in capsys.readouterr().err
+    words = ("mounting", tmp_path, "--calibration", lens, "--out", tmp_path / "tags.yaml")
+    code, _, complaint = call(calibrate_camera, *words)
+    assert code == 1
+    assert "640 x 480 px but the calibration is for 1280 x 720" in complaint
 
 
 @pytest.mark.slow
@@ -211,11 +209,10 @@ def test_pictures_come_from_a_bag(tmp_path):
         (["intrinsics", "none", "--out", "/proc/camera.yaml"], "cannot be written"),
     ],
 )
-def test_mistakes_are_named_in_one_line(tmp_path, monkeypatch, capsys, arguments, named):
+def test_mistakes_are_named_in_one_line(tmp_path, monkeypatch, call, arguments, named):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["calibrate_camera.py", *arguments])
-    assert calibrate_camera.main() == 1
-    complaint = capsys.readouterr().err
+    code, _, complaint = call(calibrate_camera, *arguments)
+    assert code == 1
     assert named in complaint
     assert len(complaint.splitlines()) == 1
 

@@ -1,4 +1,4 @@
-"""The orchestrator's view of the graph: readiness and death are told with their cause."""
+"""What the graph says of itself: to the orchestrator, and for the site."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 
 from der_planner.experiment.processes import GraphError, NodeError
+from documentation import graph
 
 pytestmark = pytest.mark.graph
 
@@ -23,3 +24,11 @@ def test_a_driver_without_its_board_ends_with_the_port_and_the_remedy(graph):
     with pytest.raises(NodeError, match=r"'pressure_driver' died \(exit code 1\)") as caught:
         graph.client.wait_ready(["pressure_driver"])
     assert port in str(caught.value)
+
+
+def test_the_kept_reference_is_what_the_graph_says(monkeypatch, request):
+    from domain import own_domain
+
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(own_domain(request.path)))
+    kept = graph.FILE.read_text()
+    assert graph.text(kept) == kept, "run python3 scripts/docs.py --graph"

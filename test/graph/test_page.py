@@ -8,16 +8,11 @@ from typing import Any
 from urllib.parse import urljoin, urlsplit
 
 import pytest
-from browsers import (
-    NEEDS_CHROMIUM,
-    open_browser,
-    signal_browser,
-    start_page,
-    webdriver,
-)
+from browsers import NEEDS_CHROMIUM, signal_browser, start_page, webdriver
 from cable import Cable
 from driver_bench import Bench
 
+from benchmarks.browser import open_browser
 from der_msgs.msg import PressurePlan, PressureState
 from limb_interfaces import qos, topics
 
@@ -44,13 +39,11 @@ class WatchedPage(Bench):
         # A limb is held for a minute while somebody watches.
         super().__init__(graph, bounds={}, on_lost_operator="vent", hold_time=60.0)
         self.client.watch([])
-        self.opened = 0
         self.browsers: list[Any] = []
         self.client.wait_ready(["page"])
 
     def open(self, url: str = "") -> Any:
-        self.opened += 1
-        browser = open_browser(self.graph.folder / f"profile{self.opened}")
+        browser = open_browser()
         self.browsers.append(browser)
         browser.get(url or self.url)
         self.wait(lambda: browser.execute_script("return !!page.data"), "live data")

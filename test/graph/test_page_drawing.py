@@ -9,15 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from browsers import (
-    NEEDS_CHROMIUM,
-    open_browser,
-    signal_browser,
-    start_page,
-    webdriver,
-)
+from browsers import NEEDS_CHROMIUM, signal_browser, start_page, webdriver
 from driver_bench import Bench
 
+from benchmarks.browser import open_browser
 from der_msgs.msg import PressurePlan, PressureState
 from der_planner.limb import Limb
 from limb_interfaces import qos, topics
@@ -55,7 +50,7 @@ def rig(graph: Any, tmp_path: Path) -> tuple[Bench, str]:
 
 @pytest.fixture
 def browser(tmp_path: Path) -> Any:
-    window = open_browser(tmp_path / "profile")
+    window = open_browser(f"--user-data-dir={tmp_path}/profile")
     yield window
     with contextlib.suppress(Exception):  # it may have been killed
         window.quit()

@@ -1,5 +1,6 @@
 """A driver and an emulated board in simulated time, without ports, threads or ROS."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -173,6 +174,20 @@ class Simulation:
             if self.mode is not Mode.FAULT:
                 assert verdict is Verdict.ACCEPTED, self.core.machine.schedule.reason
             self.tick()
+
+    def play_until_fault(self, seconds, shape, plan_id=""):
+        """Play a motion until the driver faults; return the seconds it took, or None."""
+        begin = self.steady
+        for index in range(round(seconds * 1e9 / PERIOD)):
+            self.offer(shape(self.steady - begin), plan_id=plan_id, index=index)
+            self.tick()
+            if self.mode is Mode.FAULT:
+                return self.steady - begin
+        return None
+
+    def modes_since(self, place):
+        """Return the modes since a tick in their order."""
+        return [mode for mode, _ in itertools.groupby(self.modes[place:])]
 
     def track(self, seconds=3.0):
         """Arm and play for a while, which leaves the limb pressurised."""

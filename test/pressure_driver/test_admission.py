@@ -1,17 +1,21 @@
-"""Whose setpoints are taken, and in which arming; what goes out is limited at every tick."""
+"""Whose setpoints are taken, in which arming, when they take effect, and within which limits."""
 
 import itertools
 
 import numpy as np
 import pytest
 
+from pressure_driver import schedule as schedule_module
 from pressure_driver.safety import Mode
 from pressure_driver.schedule import (
     RELEASE_TIME,
     Origin,
     Setpoint,
+    SetpointSchedule,
+    TickGrid,
     Verdict,
 )
+from pressure_driver.settings import Settings
 
 TICK = 50_000_000
 
@@ -188,3 +192,175 @@ def test_a_higher_revision_that_comes_in_time_replaces_the_earlier_one(simulate)
     assert sim.core.offer(late, sim.wall) is Verdict.LATE
     counters = sim.core.machine.schedule.counts
     assert (counters["accepted"], counters["executed"], counters["superseded"]) == (2, 1, 1)
+
+
+PERIOD = 50_000_000
+NOW = 1_700_000_000 * 1_000_000_000
+ZERO = (0.0, 0.0)
+
+
+def setpoint(steps, value=1000.0, plan_id="a", index=0, offset=0):
+    return Setpoint(NOW + steps * PERIOD + offset, (value, -value), plan_id, index)
+
+
+def offer(schedule, item, now=NOW):
+    return schedule.offer(item, now, ZERO)
+
+
+def test_a_setpoint_waits_for_its_stamp_and_is_then_held():
+    schedule = SetpointSchedule(Settings())
+    assert offer(schedule, setpoint(3)) is Verdict.ACCEPTED
+    assert [schedule.take(NOW + k * PERIOD) for k in (1, 2)] == [None, None]
+    assert schedule.take(NOW + 3 * PERIOD).differential == (1000.0, -1000.0)
+    assert schedule.take(NOW + 4 * PERIOD) is None
+    assert schedule.current.differential == (1000.0, -1000.0)
+    assert schedule.counts["executed"] == 1
+
+
+def test_a_stamp_between_ticks_takes_effect_at_the_next_one():
+    schedule = SetpointSchedule(Settings())
+    offer(schedule, setpoint(2, offset=1))
+    assert schedule.take(NOW + 2 * PERIOD) is None
+    assert schedule.take(NOW + 3 * PERIOD)
+
+
+def test_two_setpoints_within_one_tick_leave_the_later_one():
+    schedule = SetpointSchedule(Settings())
+    offer(schedule, setpoint(2, 1000.0, offset=-2 * 10**7))
+    offer(schedule, setpoint(2, 2000.0, index=1))
+    assert schedule.take(NOW + 2 * PERIOD).differential[0] == 2000.0
+    assert schedule.counts["superseded"] == 1
+
+
+def test_stamp_zero_is_the_next_tick():
+    schedule = SetpointSchedule(Settings())
+    schedule.take(NOW)
+    item = Setpoint(0, (500.0, 0.0))
+    assert offer(schedule, item, NOW + 10**6) is Verdict.ACCEPTED
+    assert schedule.take(NOW + PERIOD).differential == (500.0, 0.0)
+    # Even if the next tick has been taken while the message was under way.
+    schedule.take(NOW + 2 * PERIOD)
+    assert offer(schedule, item, NOW + PERIOD) is Verdict.ACCEPTED
+    assert schedule.take(NOW + 3 * PERIOD)
+
+
+def test_of_two_untimed_commands_within_a_tick_the_newer_one_counts():
+    schedule = SetpointSchedule(Settings())
+    schedule.take(NOW)
+    for value in (500.0, 700.0):
+        assert offer(schedule, Setpoint(0, (value, 0.0)), NOW + 10**6) is Verdict.ACCEPTED
+    assert schedule.take(NOW + PERIOD).differential == (700.0, 0.0)
+    assert schedule.counts["superseded"] == 1
+
+
+def test_late_ones_are_counted_and_refused():
+    schedule = SetpointSchedule(Settings())
+    schedule.take(NOW + 4 * PERIOD)
+    assert offer(schedule, setpoint(4), NOW + 4 * PERIOD) is Verdict.LATE
+    assert offer(schedule, setpoint(3, offset=1), NOW + 4 * PERIOD) is Verdict.LATE
+    assert offer(schedule, setpoint(5), NOW + 4 * PERIOD) is Verdict.ACCEPTED
+    assert schedule.counts["late"] == 2
+    assert "after its stamp" in schedule.reason
+
+
+def test_a_new_plan_replaces_the_old_from_its_first_stamp_on():
+    schedule = SetpointSchedule(Settings())
+    for k in range(1, 9):
+        offer(schedule, setpoint(k, 100.0 * k, index=k))
+    for k in range(5, 8):
+        assert offer(schedule, setpoint(k, 500.0 + k, "b", k)) is Verdict.ACCEPTED
+    assert schedule.counts["superseded"] == 4
+    assert offer(schedule, setpoint(9, 900.0, "a", 9)) is Verdict.REFUSED
+    assert "replaced" in schedule.reason
+    plans = []
+    for k in range(1, 10):
+        schedule.take(NOW + k * PERIOD)
+        plans.append(schedule.current.plan_id)
+    assert plans == ["a"] * 4 + ["b"] * 5
+
+
+@pytest.mark.parametrize(
+    ("values", "reason"),
+    [
+        ((float("nan"), 0.0), "not finite"),
+        ((1000.0,), "expected 2"),
+        ((1.0, 2.0, 3.0), "expected 2"),
+        ((24_000.1, 0.0), "limit is ±24000 Pa"),
+        ((0.0, -24_000.1), "limit is ±24000 Pa"),
+        ((10_000.1, 0.0), "Pa/s"),
+    ],
+)
+def test_refused_with_the_reason(values, reason):
+    schedule = SetpointSchedule(Settings())
+    item = Setpoint(NOW + PERIOD, values, "plan-7", 3)
+    assert offer(schedule, item) is Verdict.REFUSED
+    assert reason in schedule.reason
+    assert "setpoint 3 of 'plan-7'" in schedule.reason
+    assert schedule.waiting == 0
+    assert schedule.take(NOW + PERIOD) is None
+
+
+def test_too_far_ahead_is_refused():
+    schedule = SetpointSchedule(Settings(horizon=1.0))
+    assert offer(schedule, setpoint(20)) is Verdict.ACCEPTED
+    assert offer(schedule, setpoint(21, index=1)) is Verdict.REFUSED
+    assert "1.05 s ahead" in schedule.reason
+
+
+def test_slew_is_taken_between_neighbours_in_time():
+    limits = Settings(slew_limit=10_000.0)
+    schedule = SetpointSchedule(limits)
+    assert offer(schedule, setpoint(1, 500.0)) is Verdict.ACCEPTED
+    assert offer(schedule, setpoint(11, 5500.0)) is Verdict.ACCEPTED
+    # Fits behind its predecessor, but the way to the next would be too steep.
+    assert offer(schedule, setpoint(6, 2900.0)) is Verdict.REFUSED
+    assert offer(schedule, setpoint(6, 3000.0)) is Verdict.ACCEPTED
+    assert schedule.take(NOW + PERIOD)
+    # What is held counts, not how long it has been held.
+    fresh = SetpointSchedule(limits)
+    fresh.offer(setpoint(1, 500.0), NOW, ZERO)
+    fresh.take(NOW + PERIOD)
+    late = setpoint(101, 5000.0)
+    assert fresh.offer(late, NOW + 99 * PERIOD, (500.0, -500.0)) is Verdict.REFUSED
+
+
+def test_the_buffer_is_bounded(monkeypatch):
+    monkeypatch.setattr(schedule_module, "CAPACITY", 10)
+    schedule = SetpointSchedule(Settings())
+    verdicts = [offer(schedule, setpoint(k, 1.0 * k, index=k)) for k in range(1, 13)]
+    assert verdicts == [Verdict.ACCEPTED] * 10 + [Verdict.REFUSED] * 2
+
+
+# ----------------------------------------------------------------------------------- clocks
+
+
+def test_ticks_fall_on_the_grid_and_never_before_it():
+    grid = TickGrid(PERIOD)
+    wall = NOW + 12_345_678
+    grid.take(wall)
+    for _ in range(1000):
+        wall += round(grid.delay(wall) * 1e9) + 7_000
+        instant = grid.take(wall)
+        assert instant is not None
+        assert instant % PERIOD == 0
+        assert 0 <= wall - instant < 20_000
+        assert grid.take(wall) is None
+    assert grid.missed == 0
+
+
+def test_a_late_wake_skips_what_is_over_and_counts_it():
+    grid = TickGrid(PERIOD)
+    grid.take(NOW)
+    assert grid.take(NOW + PERIOD) == NOW + PERIOD
+    assert grid.take(NOW + 5 * PERIOD + 10**6) == NOW + 5 * PERIOD
+    assert grid.missed == 3
+
+
+@pytest.mark.parametrize("step", [-3600, -1, 1, 3600])
+def test_a_stepped_wall_clock_moves_the_grid_and_does_not_stop_it(step):
+    grid = TickGrid(PERIOD)
+    grid.take(NOW)
+    moved = NOW + step * 1_000_000_000
+    for count in range(1, 40):
+        assert grid.delay(moved + count * PERIOD - 1) <= PERIOD / 1e9
+        assert grid.take(moved + count * PERIOD) == moved + count * PERIOD

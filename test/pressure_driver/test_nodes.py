@@ -3,13 +3,13 @@
 import contextlib
 import os
 import signal
-import socket
 import subprocess
 import time
 import uuid
 
 import numpy as np
 import pytest
+from domain import free_port
 from driver_bench import PERIOD, Bench, difference
 from std_msgs.msg import Float64MultiArray
 
@@ -163,8 +163,7 @@ def test_a_lab_s_own_driver_is_played_and_vented_when_this_one_dies(graph):
     setpoints = client.node.create_publisher(
         PressureSetpoint, topics.PRESSURE_SETPOINT, qos.SETPOINTS
     )
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = f"tcp://127.0.0.1:{free.getsockname()[1]}"
+    port = f"tcp://127.0.0.1:{free_port()}"
     board = graph.start("pressure_driver", "topic_board", listen=port, scale=0.001)
     client.wait_ready(["topic_board"])
     lab = {"protocol": "native", "supply_required": False, "wiring": "3,4,1,2"}

@@ -52,8 +52,7 @@ def test_a_limb_whose_operator_is_lost_stops_as_was_chosen(simulate, policy, mod
     assert "the operator (page) is lost" in sim.core.machine.schedule.reason
     play_on(sim, Mode.DISARMED)
     assert sim.vented
-    seen = sim.modes[begin:]
-    assert [m for k, m in enumerate(seen) if k and m is not seen[k - 1]] == modes
+    assert sim.modes_since(begin) == [Mode.TRACKING, *modes]
     assert sim.offer((1_000.0, 0.0), plan_id="new") is Verdict.REFUSED
     sim.arm()
     assert sim.core.state()["lost_operator"] == ""

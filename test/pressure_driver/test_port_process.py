@@ -14,6 +14,7 @@ import time
 from types import SimpleNamespace
 
 import pytest
+from domain import free_port
 from serial import SerialException
 from waiting import wait_for
 
@@ -39,18 +40,16 @@ SENSOR_RANGE = 100_000.0
 """[Pa] of PneuDrive boards: with the nominal range, a step of the readings is 842 Pa."""
 
 
-def network_address():
-    """Return an address of this computer at which nobody listens."""
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        return f"tcp://127.0.0.1:{free.getsockname()[1]}"
-
-
 class Rig:
     """An emulated board in this process, and a driver on its port; its times are short."""
 
     def __init__(self, folder, protocol):
         self.commands = []
-        link = network_address() if protocol == "festo" else str(folder / f"board_{protocol}")
+        link = (
+            f"tcp://127.0.0.1:{free_port()}"
+            if protocol == "festo"
+            else str(folder / f"board_{protocol}")
+        )
         self.port = emulated_line(link, 115_200)
         air = BoardPneumatics(2, 1)
         # Valves ten times as wide, so that nobody waits for the air.
@@ -424,7 +423,7 @@ def test_a_port_is_kept_by_its_stable_name(tmp_path, monkeypatch):
 
 
 def test_a_board_that_nobody_reaches_is_named_with_the_remedy():
-    address = network_address()
+    address = f"tcp://127.0.0.1:{free_port()}"
     with pytest.raises(PortError, match=f"no board answers at {re.escape(address)}"):
         PortProcess(Settings(port=address, protocol="festo"), lambda: None).start()
     for text in ("tcp://host", "tcp://a:b:1", "tcp://host:70000"):

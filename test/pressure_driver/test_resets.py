@@ -67,14 +67,7 @@ def test_echoes_that_stop_are_a_fault_within_two_seconds(simulate, protocol):
     sim = simulate(protocol)
     sim.track()
     sim.have("echoless")
-    begin = sim.steady
-    for index in range(60):
-        sim.offer((2_000.0, -2_000.0), plan_id="on", index=index)
-        sim.tick()
-        if sim.mode is Mode.FAULT:
-            break
-    assert sim.mode is Mode.FAULT
-    assert sim.steady - begin < 2.0
+    assert sim.play_until_fault(3.0, lambda _: (2_000.0, -2_000.0), "on") < 2.0
     assert "not answered" in " ".join(sim.faults)
     assert "not answered" in " ".join(sim.core.obstacles())
     sim.have()

@@ -16,17 +16,6 @@ def steady(_):
     return (8_000.0, -5_000.0)
 
 
-def stream_until_fault(sim, seconds, shape=steady):
-    """Play setpoints until the driver faults; return the seconds it took, or None."""
-    begin = sim.steady
-    for index in range(round(seconds * 20)):
-        sim.offer(shape(sim.steady - begin), index=index)
-        sim.tick()
-        if sim.mode is Mode.FAULT:
-            return sim.steady - begin
-    return None
-
-
 def rise_to_steady(sim):
     sim.arm()
     sim.stream(4.0, lambda t: tuple(min(t / 2.0, 1.0) * value for value in steady(t)))
@@ -40,7 +29,7 @@ def test_a_leak_that_the_regulator_makes_up_for_shows_in_its_inlet_valve(simulat
     rise_to_steady(sim)
     sim.have("leak:0:0.4")
     # The pressure hardly falls: it is no matter for the following check.
-    assert stream_until_fault(sim, 30.0) < 22.0
+    assert sim.play_until_fault(30.0, steady) < 22.0
     assert "chamber 0 loses air: its inlet valve was open" in sim.faults[0]
     assert sim.gauge.max() > 6_000.0
     sim.run(8.0)
@@ -52,7 +41,7 @@ def test_a_chamber_that_stays_a_little_below_its_command_is_a_leak(simulate, pro
     sim = simulate(protocol, leak_opening=1.0)
     rise_to_steady(sim)
     sim.have("leak:3:4.5")  # its regulator leaves 1.3 kPa missing
-    assert stream_until_fault(sim, 30.0) < 20.0
+    assert sim.play_until_fault(30.0, steady) < 20.0
     assert "chamber 3 loses air" in sim.faults[0]
     assert "below its command" in sim.faults[0]
 
@@ -70,7 +59,7 @@ def test_telemetry_that_repeats_itself_is_a_fault_under_a_steady_command(simulat
         board.reading = lambda: replace(
             reading, time=board._time, last_sequence=board._sequence, vented=False
         )
-    assert stream_until_fault(sim, 20.0) < 3.0
+    assert sim.play_until_fault(20.0, steady) < 3.0
     assert re.search("is frozen|no telemetry", sim.faults[0])
     sim.run(8.0)
     assert sim.vented
@@ -81,7 +70,7 @@ def test_rounded_readings_may_stand_still(simulate):
     rise_to_steady(sim)
     board, reading = sim.board, sim.board.reading()
     board.reading = lambda: replace(reading, time=board._time, last_sequence=board._sequence)
-    assert stream_until_fault(sim, 5.0) is None, sim.faults
+    assert sim.play_until_fault(5.0, steady) is None, sim.faults
 
 
 @pytest.mark.slow
@@ -95,14 +84,14 @@ def test_no_motion_of_a_sound_limb_is_taken_for_a_leak(simulate, protocol, seed,
     def motion(t):
         return (10_000.0 * np.sin(rate * t), 12_000.0 * (1.0 - np.cos(rate * t)) / 2.0)
 
-    assert stream_until_fault(sim, 60.0, motion) is None, sim.faults
+    assert sim.play_until_fault(60.0, motion) is None, sim.faults
 
 
 def test_a_board_that_fills_a_little_too_high_ends_vented(simulate):
     sim = simulate("ezloop")
     sim.board.atmosphere += 1_800.0  # what it took for the room's pressure
     rise_to_steady(sim)
-    assert stream_until_fault(sim, 20.0) < 16.0
+    assert sim.play_until_fault(20.0, steady) < 16.0
     assert "filled too high" in sim.faults[0]
     assert "powered anew" in sim.faults[0]
 

@@ -20,8 +20,7 @@ def test_a_whole_life(simulate, protocol):
     sim.run_until(lambda: sim.mode is not Mode.HOLDING)
     sim.run_until(lambda: sim.mode is not Mode.VENTING)
     sim.run_until(lambda: sim.vented, 10.0)
-    order = [m for k, m in enumerate(sim.modes) if k == 0 or m is not sim.modes[k - 1]]
-    assert order == [
+    assert sim.modes_since(0) == [
         Mode.DISARMED, Mode.ARMED, Mode.TRACKING, Mode.HOLDING, Mode.VENTING, Mode.ARMED,
     ]  # fmt: skip
     counters = sim.core.machine.schedule.counts

@@ -1,8 +1,9 @@
-"""The ROS domain of a test file: tests beside each other or one after the other do not mix."""
+"""The ROS domain of a test file, and free ports: tests beside each other do not mix."""
 
 from __future__ import annotations
 
 import os
+import socket
 import zlib
 from pathlib import Path
 
@@ -23,3 +24,9 @@ def own_domain(file: str | Path) -> int:
     session = os.getpid() if worker is None else os.getppid()
     place = 0 if worker is None else int(worker.removeprefix("gw"))
     return FIRST + (session + 3 * zlib.crc32(Path(file).name.encode()) + place) % COUNT
+
+
+def free_port() -> int:
+    """Return a port of this computer at which nobody listens."""
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        return free.getsockname()[1]

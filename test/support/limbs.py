@@ -10,12 +10,26 @@ from der_planner.twin.hardware import DrawnHardware, draw
 
 
 def with_segments(limb, **changes):
-    """Return a limb or hardware with new values, or functions of a segment, in each segment."""
+    """Return a limb or hardware whose segments have other values.
 
-    def changed(segment):
-        return {name: new(segment) if callable(new) else new for name, new in changes.items()}
+    Each is the same for all, or a list of one for each segment, or a function of the segment.
+    """
 
-    return replace(limb, segments=tuple(replace(s, **changed(s)) for s in limb.segments))
+    def value(new, place):
+        if isinstance(new, list):
+            return new[place]
+        return new(limb.segments[place]) if callable(new) else new
+
+    segments = tuple(
+        replace(segment, **{name: value(new, place) for name, new in changes.items()})
+        for place, segment in enumerate(limb.segments)
+    )
+    return replace(limb, segments=segments)
+
+
+def with_air(limb: Limb, **changes: float) -> Limb:
+    """Return a limb whose chambers and valves have other values."""
+    return replace(limb, pneumatics=replace(limb.pneumatics, **changes))
 
 
 def of_pressures(limb: Limb, factor: float) -> Limb:
@@ -23,9 +37,8 @@ def of_pressures(limb: Limb, factor: float) -> Limb:
     air = limb.pneumatics
     vent_rate = air.vent_rate * factor ** (1.0 - air.vent_exponent)
     limits = {key: factor * getattr(air, key) for key in ("pressure_limit", "slew_limit")}
-    limb = replace(limb, pneumatics=replace(air, vent_rate=vent_rate, **limits))
     return with_segments(
-        limb,
+        with_air(limb, vent_rate=vent_rate, **limits),
         moment_gain=lambda s: s.moment_gain / factor,
         pressure_stiffening=lambda s: s.pressure_stiffening / factor,
     )

@@ -145,11 +145,14 @@ class LinkChain:
                 first[link] += value * along
                 second[link] += value * along**2
         outboard = np.append(np.cumsum(mass[::-1])[::-1][1:], 0.0)
+        first += self._lengths * outboard
+        index = np.arange(count)
+        low, high = np.minimum.outer(index, index), np.maximum.outer(index, index)
+        inertia = self._lengths[low] * first[high]
+        np.fill_diagonal(inertia, second + self._lengths**2 * outboard)
         return Links(
-            length=self._lengths,
-            outboard=outboard,
-            first=first + self._lengths * outboard,
-            second=second,
+            inertia=inertia,
+            first=first,
             stiffness=self._stiffness,
             viscosity=getattr(self, "_viscosity", np.zeros(count)),
             hardening=self._hardening,
@@ -185,7 +188,7 @@ class LinkChain:
         self._generator = np.random.default_rng([self.seed, run])
         self._noise = noise
         self._factor = np.ones(SEGMENTS)
-        self._push = (np.array([-1.0, 0.0]), np.zeros(2))
+        self.push(0.0, (0.0, 0.0))
         self._time = 0.0
         count = len(self._lengths)
         self._state = State(
@@ -204,9 +207,8 @@ class LinkChain:
         thick = self._built._replace(
             viscosity=20.0 * self._viscosity, slip=np.zeros_like(self._slip)
         )
-        still, nowhere = np.zeros(SEGMENTS), (np.array([-1.0, 0.0]), np.zeros(2))
         for _ in range(100):
-            advance(self._state, still, STEP, 300, *nowhere, thick, self._air)
+            advance(self._state, np.zeros(SEGMENTS), STEP, 300, *self._push, thick, self._air)
             if np.abs(self._state.rate).max() < 1e-6:
                 break
         self._state.rate[:] = 0.0
@@ -230,7 +232,10 @@ class LinkChain:
     def push(self, at: float, force: ArrayLike) -> None:
         """Push with a force (2,) [N] at an arc length [m] from now on; zeros end it."""
         link, along = self._place(at)
-        self._push = (np.array([link, along]), np.array(force, dtype=float))
+        arms = np.where(np.arange(len(self._lengths)) < link, self._lengths, 0.0)
+        if link >= 0:
+            arms[link] = along
+        self._push = (arms, np.array(force, dtype=float))
 
     def _rebuild(self) -> None:
         self._built = self._links(self.gravity[:2], self.masses, self._factor)
@@ -304,12 +309,9 @@ class LinkChain:
 
 def _first_frequency(links: Links) -> float:
     """Return the first natural frequency of the straight chain without loads [rad/s]."""
-    index = np.arange(len(links.length))
-    low, high = np.minimum.outer(index, index), np.maximum.outer(index, index)
-    mass = links.length[low] * links.first[high]
-    np.fill_diagonal(mass, links.second + links.length**2 * links.outboard)
-    turn = np.eye(len(index)) - np.eye(len(index), k=-1)
-    squares = eigvalsh(turn.T @ np.diag(links.stiffness) @ turn, mass)
+    count = len(links.stiffness)
+    turn = np.eye(count) - np.eye(count, k=-1)
+    squares = eigvalsh(turn.T @ np.diag(links.stiffness) @ turn, links.inertia)
     return float(np.sqrt(squares[0]))
 
 

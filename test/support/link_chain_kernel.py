@@ -26,10 +26,8 @@ ORIFICE_BAND = 1500.0
 class Links(NamedTuple):
     """Mechanics of n links and joints in M segments; R play operators a segment."""
 
-    length: np.ndarray  # (n,) [m]
-    outboard: np.ndarray  # (n,) R_i [kg]
+    inertia: np.ndarray  # (n, n) a_ij [kg m²]
     first: np.ndarray  # (n,) B_i [kg m]
-    second: np.ndarray  # (n,) J_i [kg m²]
     stiffness: np.ndarray  # (n,) [N m/rad]
     viscosity: np.ndarray  # (n,) [N m s/rad]
     hardening: np.ndarray  # (n,) relative growth of a spring's torque per φ² [1/rad²]
@@ -61,100 +59,72 @@ class State(NamedTuple):
 @njit(cache=True)
 def breathe(pressure, command, h, air):
     """Advance the chambers by h under commands (M,) [Pa]: one of a pair is filled, one vented."""
-    for m in range(command.shape[0]):
-        for side in range(2):
-            goal = max(command[m] if side == 0 else -command[m], 0.0)
-            now = pressure[m, side]
-            error = goal - now
-            opening = min(1.0, abs(error) / ORIFICE_BAND)
-            if goal == 0.0:
-                opening = 1.0  # a chamber that is to be empty has its outlet wide open
-            if error > 0.0:
-                now += h * opening * air.inlet[m, side] * np.sqrt(max(air.supply - now, 0.0))
-                now = min(now, goal)
-            elif error < 0.0:
-                now -= h * opening * air.outlet[m, side] * np.sqrt(max(now, 0.0))
-                now = max(now, goal)
-            pressure[m, side] = now
+    goal = np.stack((np.maximum(command, 0.0), np.maximum(-command, 0.0)), axis=1)
+    # A chamber that is to be empty has its outlet wide open.
+    opening = np.where(goal == 0.0, 1.0, np.minimum(np.abs(goal - pressure) / ORIFICE_BAND, 1.0))
+    filled = pressure + h * opening * air.inlet * np.sqrt(np.maximum(air.supply - pressure, 0.0))
+    vented = pressure - h * opening * air.outlet * np.sqrt(np.maximum(pressure, 0.0))
+    filling = goal > pressure
+    pressure[:] = np.where(filling, np.minimum(filled, goal), np.maximum(vented, goal))
 
 
 @njit(cache=True)
-def curved_torques(heading, stuck, pressure, links):
+def of_joints(headings):
+    """Return (n,) what the headings of the links, or their changes, are at the joints."""
+    joints = headings.copy()
+    joints[1:] -= headings[:-1]
+    return joints
+
+
+@njit(cache=True)
+def curved_torques(bent, stuck, pressure, links):
     """Return (n,) torques of drive, friction and hardening: all but linear springs and dashpots."""
-    count, segments = heading.shape[0], stuck.shape[0]
-    friction = np.zeros(segments)
-    for m in range(segments):
-        for r in range(stuck.shape[1]):
-            friction[m] += links.slip[m, r] * stuck[m, r] / links.width[r]
-    torque = np.empty(count)
-    for i in range(count):
-        m = links.owner[i]
-        bent = heading[i] - (heading[i - 1] if i > 0 else 0.0) - links.rest[i]
-        torque[i] = links.gain[m, 0] * pressure[m, 0] - links.gain[m, 1] * pressure[m, 1]
-        torque[i] -= friction[m] + links.stiffness[i] * links.hardening[i] * bent**3
-    return torque
+    drive = links.gain[:, 0] * pressure[:, 0] - links.gain[:, 1] * pressure[:, 1]
+    drive -= (links.slip * stuck / links.width).sum(axis=1)
+    return drive[links.owner] - links.stiffness * links.hardening * bent**3
 
 
 @njit(cache=True)
-def slide(stuck, heading, change, links, share, out):
-    """Write the friction elements' stored bend after ``share`` of a change of the headings."""
-    for m in range(stuck.shape[0]):
-        moved = 0.0
-        for i in range(heading.shape[0]):
-            if links.owner[i] == m:
-                moved += share * (change[i] - (change[i - 1] if i > 0 else 0.0))
-        for r in range(stuck.shape[1]):
-            out[m, r] = min(max(stuck[m, r] + moved, -links.width[r]), links.width[r])
+def slid(stuck, change, links):
+    """Return the friction elements' stored bend after a change of the headings."""
+    moved = np.zeros((len(stuck), 1))
+    for joint, turned in enumerate(of_joints(change)):
+        moved[links.owner[joint]] += turned
+    return np.minimum(np.maximum(stuck + moved, -links.width), links.width)
 
 
 @njit(cache=True)
 def move(state, h, push, links):
     """Advance the links by h; ``push`` (n,) is the torque of outer forces on each heading."""
-    count = state.heading.shape[0]
     rate = state.rate
     middle = state.heading + 0.5 * h * rate
-    stuck = np.empty_like(state.stuck)
-    slide(state.stuck, state.heading, h * rate, links, 0.5, stuck)
-    curved = curved_torques(middle, stuck, state.pressure, links)
-    torque = np.empty(count)
-    for i in range(count):
-        bent = middle[i] - (middle[i - 1] if i > 0 else 0.0) - links.rest[i]
-        turning = rate[i] - (rate[i - 1] if i > 0 else 0.0)
-        torque[i] = curved[i] - links.stiffness[i] * bent - links.viscosity[i] * turning
-    matrix, right = np.zeros((count, count)), np.empty(count)
-    for i in range(count):
-        force = torque[i] - (torque[i + 1] if i + 1 < count else 0.0) + push[i]
-        force += links.first[i] * (
-            links.gravity[1] * np.cos(middle[i]) - links.gravity[0] * np.sin(middle[i])
-        )
-        matrix[i, i] = links.second[i] + links.length[i] ** 2 * links.outboard[i]
-        for j in range(count):
-            if j == i:
-                continue
-            low, high = min(i, j), max(i, j)
-            coupled = links.length[low] * links.first[high]
-            turn = middle[i] - middle[j]
-            force -= coupled * np.sin(turn) * rate[j] ** 2
-            matrix[i, j] = coupled * np.cos(turn)
-        right[i] = h * force
-    for i in range(count):
-        bent = middle[i] - (middle[i - 1] if i > 0 else 0.0) - links.rest[i]
-        spring = links.stiffness[i] * (1.0 + 3.0 * links.hardening[i] * bent**2)
-        held = 0.5 * h * links.viscosity[i] + 0.25 * h * h * spring
-        matrix[i, i] += held
+    bent = of_joints(middle) - links.rest
+    stuck = slid(state.stuck, 0.5 * h * rate, links)
+    torque = curved_torques(bent, stuck, state.pressure, links)
+    torque -= links.stiffness * bent + links.viscosity * of_joints(rate)
+    along, across = links.gravity
+    force = torque + push + links.first * (across * np.cos(middle) - along * np.sin(middle))
+    force[:-1] -= torque[1:]
+    turn = middle.reshape(-1, 1) - middle
+    force -= (links.inertia * np.sin(turn)) @ rate**2
+    matrix = links.inertia * np.cos(turn)
+    spring = links.stiffness * (1.0 + 3.0 * links.hardening * bent**2)
+    held = 0.5 * h * links.viscosity + 0.25 * h * h * spring
+    for i in range(len(held)):
+        matrix[i, i] += held[i]
         if i > 0:
-            matrix[i - 1, i - 1] += held
-            matrix[i, i - 1] -= held
-            matrix[i - 1, i] -= held
-    right = np.linalg.solve(matrix, right)
-    change = h * (rate + 0.5 * right)
-    slide(state.stuck, state.heading, change, links, 1.0, state.stuck)
+            matrix[i - 1, i - 1] += held[i]
+            matrix[i, i - 1] -= held[i]
+            matrix[i - 1, i] -= held[i]
+    gained = np.linalg.solve(matrix, h * force)
+    change = h * (rate + 0.5 * gained)
+    state.stuck[:] = slid(state.stuck, change, links)
     state.heading[:] += change
-    state.rate[:] += right
+    state.rate[:] += gained
 
 
 @njit(cache=True)
-def advance(state, command, h, steps, push_at, push_force, links, air):
+def advance(state, command, h, steps, arms, pushed, links, air):
     """Advance by ``steps`` of h [s] under commands (M,) [Pa] and a push.
 
     Args:
@@ -162,24 +132,12 @@ def advance(state, command, h, steps, push_at, push_force, links, air):
         command: (M,) differential pressures [Pa].
         h: [s].
         steps: their number.
-        push_at: (link, distance along it [m]) of the point that is pushed.
-        push_force: (2,) [N].
+        arms: (n,) of the push along each link [m].
+        pushed: (2,) [N].
         links: of the chain.
         air: of the chambers.
     """
-    count = state.heading.shape[0]
-    push = np.zeros(count)
     for _ in range(steps):
         breathe(state.pressure, command, h, air)
-        if push_force[0] != 0.0 or push_force[1] != 0.0:
-            for i in range(count):
-                arm = 0.0
-                if i < push_at[0]:
-                    arm = links.length[i]
-                elif i == push_at[0]:
-                    arm = push_at[1]
-                push[i] = arm * (
-                    push_force[1] * np.cos(state.heading[i])
-                    - push_force[0] * np.sin(state.heading[i])
-                )
-        move(state, h, push, links)
+        turned = pushed[1] * np.cos(state.heading) - pushed[0] * np.sin(state.heading)
+        move(state, h, arms * turned, links)

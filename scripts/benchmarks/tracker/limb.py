@@ -8,8 +8,8 @@ is overconfident.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-import os
 import tempfile
 import time
 from collections.abc import Callable
@@ -23,30 +23,25 @@ from numpy.typing import NDArray
 from apriltag_tracker.detection import Detector
 from apriltag_tracker.pipeline import LimbTracker
 from apriltag_tracker.synthetic.camera import CameraModel, Optics, SyntheticCamera
-from apriltag_tracker.synthetic.shapes import Shape, constant_curvature
 from apriltag_tracker.tag_map import TagMap
-from benchmarks import cpu_time
+from benchmarks import show
+from benchmarks.tracker import Swing
 from benchmarks.tracker.renderer import Scene, render
 from der_msgs.msg import ChamberPressures, LimbState
 from der_planner.experiment.client import GraphClient
-from der_planner.experiment.processes import NodeProcess
+from der_planner.experiment.console import Progress
+from der_planner.experiment.graph_run import RunningGraph
+from der_planner.experiment.processes import NodeSpec
 from limb_interfaces import qos, topics
 from limb_interfaces.stamps import nanoseconds
 from workspace_setup.basics import ROOT
 
 CONFIG = ROOT / "src" / "apriltag_tracker" / "config"
 PERIOD = 1.0 / 30.0
-_DOMAIN = "97"
 SCENES = (
     Scene("14px", pixels=14.0, blur=0.5),
-    Scene("20px", pixels=20.0),
     Scene("30px"),
-    Scene("45px", pixels=45.0),
-    Scene("blur_1.0px", blur=1.0),
-    Scene("blur_1.5px", blur=1.5),
-    Scene("defocus_2px", defocus=2.0),
     Scene("noise_12", noise=12.0),
-    Scene("smear_2px", smear=2.0),
     Scene("smear_4px", smear=4.0),
     Scene("smear_6px", smear=6.0),
     Scene("dark_0.12", contrast=0.12),
@@ -147,31 +142,19 @@ def measure_false_tags(count: int) -> dict[str, float]:
     return {"random_pictures": float(count), "false_tags_in_random_pictures": float(false)}
 
 
-def swing(tags: TagMap, moment: float) -> Shape:
-    """Return the limb at a moment [s]: each segment swings at its own period."""
-    bends = 0.8 * np.sin(2.0 * np.pi * moment / np.array([3.0, 4.0]))
-    return constant_curvature(tags.segment_lengths, bends.tolist())
-
-
 def measure_swing(frames: int, exposure: float) -> dict[str, float]:
-    """Follow a swinging limb; each picture is also searched in full."""
+    """Follow a swinging limb."""
     tags = dataclasses.replace(TagMap.from_yaml(CONFIG / "tags.yaml"), stiff=())
     model = CameraModel.from_yaml(CONFIG / "synthetic_camera.yaml")
     camera = SyntheticCamera(model, tags, Optics(exposure=exposure))
-    tracker, detector = LimbTracker(tags, model.intrinsics), Detector()
-    times, searches, renders, gaps, nees, corners, asked = [], [], [], [], [], [], 0
+    tracker, swing = LimbTracker(tags, model.intrinsics), Swing(tags)
+    times, gaps, nees, corners, asked = [], [], [], [], 0
     for k in range(frames):
-        shape, later = swing(tags, k * PERIOD), swing(tags, k * PERIOD + 1e-3)
-        points, heading = later.points - shape.points, later.heading - shape.heading
-        moments = [time.process_time()]
-        frame = camera.frame(shape, Shape(shape.arc_length, 1e3 * points, 1e3 * heading))
-        moments.append(time.process_time())
+        shape = swing.shape(k * PERIOD)
+        frame = camera.frame(shape, swing.velocity(k * PERIOD))
+        begin = time.process_time()
         observation = tracker.observe(frame.image, k * PERIOD)
-        moments.append(time.process_time())
-        detector.detect(frame.image)
-        moments.append(time.process_time())
-        for kept, took in zip((renders, times, searches), np.diff(moments), strict=True):
-            kept.append(1e3 * took)
+        times.append(1e3 * (time.process_time() - begin))
         asked += len(frame.corners)
         seen = [placed.tag for placed in observation.tags]
         corners += [tag.corners - frame.corners[tag.id] for tag in seen]
@@ -190,11 +173,10 @@ def measure_swing(frames: int, exposure: float) -> dict[str, float]:
         "tip_nees": float(np.mean(nees)),
         "image_to_limb_median_cpu_ms": float(np.median(times)),
         "image_to_limb_p99_cpu_ms": float(np.percentile(times, 99)),
-        "full_search_cpu_ms": float(np.median(searches)),
-        "render_cpu_ms": float(np.median(renders)),
     }
     name = f"swing_{1e3 * exposure:.0f}ms"
-    _show(f"A limb that swings, {1e3 * exposure:.0f} ms of exposure, {frames} pictures", result)
+    print(f"\nA limb that swings, {1e3 * exposure:.0f} ms of exposure, {frames} pictures")
+    show(result)
     return {f"{name}_{key}": value for key, value in result.items()}
 
 
@@ -202,39 +184,27 @@ def measure_graph(seconds: float) -> dict[str, float]:
     """Run twin, camera and tracker as nodes and compare the tracker's tip with the twin's own."""
     states: dict[int, LimbState] = {}
     truth: dict[int, LimbState] = {}
-    names = {"limb_twin": "der_planner", "synthetic_camera": "apriltag_tracker"}
-    names["apriltag_tracker"] = "apriltag_tracker"
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        GraphClient("tracker_benchmark", int(_DOMAIN)) as client,
-    ):
-        environment = {**os.environ, "ROS_DOMAIN_ID": _DOMAIN}
-        nodes = {
-            name: NodeProcess(package, name, {}, Path(folder), None, environment, name)
-            for name, package in names.items()
-        }
-        try:
-            client.watch(list(nodes.values()))
-            for topic, kept in ((topics.LIMB_STATE, states), (topics.TWIN_GROUND_TRUTH, truth)):
-                client.subscribe(
-                    LimbState,
-                    topic,
-                    qos.STATES,
-                    lambda message, kept=kept: kept.update(
-                        {nanoseconds(message.header.stamp): message}
-                    ),
-                )
-            _press(client)
-            client.wait_for(lambda: len(states) > 60, 60.0, "the tracker")
-            states.clear()
-            before = {name: cpu_time(node.pid) for name, node in nodes.items()}
-            started = time.monotonic()
-            client.spin(seconds)
-            took = time.monotonic() - started
-            cpu = {name: cpu_time(node.pid) - before[name] for name, node in nodes.items()}
-        finally:
-            for node in nodes.values():
-                node.stop()
+    packages = {"limb_twin": "der_planner"}
+    packages |= dict.fromkeys(("synthetic_camera", "apriltag_tracker"), "apriltag_tracker")
+    with contextlib.ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        client = stack.enter_context(GraphClient("benchmark"))
+        for topic, kept in ((topics.LIMB_STATE, states), (topics.TWIN_GROUND_TRUTH, truth)):
+
+            def keep(message: LimbState, kept: dict[int, LimbState] = kept) -> None:
+                kept[nanoseconds(message.header.stamp)] = message
+
+            client.subscribe(LimbState, topic, qos.STATES, keep)
+        _press(client)
+        graph = RunningGraph(client, Progress())
+        stack.callback(graph.stop)
+        specs = [NodeSpec(package, name) for name, package in packages.items()]
+        graph.start(specs, folder, {})
+        client.wait_for(lambda: len(states) > 60, 60.0, "the tracker")
+        states.clear()
+        started = time.monotonic()
+        client.spin(seconds)
+        took = time.monotonic() - started
     both = [stamp for stamp in states if stamp in truth and states[stamp].valid]
     gaps = 1e3 * np.array(
         [(states[k].tip.x - truth[k].tip.x, states[k].tip.y - truth[k].tip.y) for k in both]
@@ -248,8 +218,8 @@ def measure_graph(seconds: float) -> dict[str, float]:
         "graph_latency_median_ms": float(np.median(latency)),
         "graph_latency_p99_ms": float(np.percentile(latency, 99)),
     }
-    result.update({f"graph_cpu_{name}_percent": 100.0 * used / took for name, used in cpu.items()})
-    _show(f"Nodes, {took:.0f} s; latency from the shape's stamp to the published tip", result)
+    print(f"\nNodes, {took:.0f} s; latency from the shape's stamp to the published tip")
+    show(result)
     return result
 
 
@@ -270,12 +240,6 @@ def _press(client: GraphClient) -> None:
         publisher.publish(message)
 
     client.node.create_timer(0.02, publish)
-
-
-def _show(title: str, figures: dict[str, float]) -> None:
-    print(f"\n{title}")
-    for key, value in figures.items():
-        print(f"  {key:42s} {value:9.3f}", flush=True)
 
 
 def run(quick: bool) -> dict[str, float | str]:

@@ -1,3 +1,5 @@
+"""The limb's shape from its tags, and its clamp where the map has it elsewhere."""
+
 from __future__ import annotations
 
 import dataclasses
@@ -5,7 +7,11 @@ import re
 
 import numpy as np
 import pytest
+import yaml
+from scipy.spatial.transform import Rotation
 
+from apriltag_tracker.bodies.body_map import BodyMap
+from apriltag_tracker.pose.clamp import Clamp, at_clamp, find_clamp
 from apriltag_tracker.pose.curve import Curve, Evaluation
 from apriltag_tracker.pose.following import LimbFollower
 from apriltag_tracker.pose.shape import (
@@ -15,14 +21,9 @@ from apriltag_tracker.pose.shape import (
     ShapePrior,
 )
 from apriltag_tracker.synthetic.shapes import Shape, constant_curvature
+from apriltag_tracker.tag_map import TagMap
 
 NOISE = np.diag([2e-5, 2e-5, 1e-3]) ** 2
-
-
-@pytest.fixture
-def plain(tags):
-    """The default tags on a limb without stiff stretches, on which arcs are exact."""
-    return dataclasses.replace(tags, stiff=())
 
 
 def seen(tags, shape: Shape, random=None) -> list[PlanarTag]:
@@ -145,6 +146,22 @@ def test_a_gap_is_bridged_for_a_few_usual_frames_while_the_tip_is_known(plain, l
     assert "no limb tag in the image" in found.reason
 
 
+def test_a_bridge_grows_unsure_and_is_given_up(plain):
+    follower = LimbFollower(plain, FollowerOptions(bridge_frames=3))
+    for k, bend in enumerate((0.4, 0.41, 0.42)):
+        shape = constant_curvature(plain.segment_lengths, [bend, bend])
+        known = follower.follow(seen(plain, shape), 0.03 * k).estimate
+    bridged = [follower.follow([], 0.03 * k) for k in range(3, 7)]
+    spreads = [
+        np.trace(each.tip_covariance) for each in (known, *(b.estimate for b in bridged[:3]))
+    ]
+    assert np.all(np.diff(spreads) > 0.0)
+    assert bridged[2].reason.startswith("bridged 3 frames")
+    assert np.hypot(*(bridged[0].estimate.tip - shape.points[-1])) < 0.01
+    assert bridged[3].estimate is None
+    assert follower.follow(seen(plain, shape), 0.3).estimate is not None
+
+
 def test_what_cannot_be_the_limb_of_the_map_is_refused_with_the_remedy(plain):
     placed = seen(plain, constant_curvature(plain.segment_lengths, [0.1, 0.2]))
     small = [dataclasses.replace(tag, pose=tag.pose * [1e-3, 1e-3, 1.0]) for tag in placed]
@@ -158,3 +175,52 @@ def test_what_cannot_be_the_limb_of_the_map_is_refused_with_the_remedy(plain):
     alone = dataclasses.replace(plain, limb=plain.limb[:1])
     found = LimbFollower(alone, FollowerOptions()).follow(placed[:1], 0.0)
     assert re.fullmatch(r"the tip is known to \d+ mm only", found.reason)
+
+
+CLAMP = np.array([0.006, -0.004, 0.05])
+
+
+@pytest.fixture
+def places(tags, swing):
+    """Noisy places of the tags of a limb whose clamp is beside `limb_base`, (K, n, 3)."""
+    random = np.random.default_rng(6)
+    cosine, sine = np.cos(CLAMP[2]), np.sin(CLAMP[2])
+    turn = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    found = [
+        [turn @ swing.shape(time).at(tag.arc_length) + CLAMP for tag in tags.limb]
+        for time in np.arange(0.0, 6.0, 0.1)
+    ]
+    return np.array(found) + random.standard_normal((60, len(tags.limb), 3)) * [1e-4, 1e-4, 2e-3]
+
+
+def test_the_clamp_is_found_with_its_deviation(tags, plain, places):
+    places[3, 2] = np.nan
+    clamp = find_clamp(plain, places)
+    assert abs(clamp.place[2] - CLAMP[2]) < 0.01
+    assert np.abs(clamp.place[:2] - CLAMP[:2]).max() < 6e-4
+    assert (clamp.sigma < [1e-3, 1e-3, 0.03]).all()
+    places[:, 1:] = np.nan
+    assert find_clamp(tags, places) is None
+
+
+def test_maps_are_written_with_their_base_at_the_clamp(config, tags):
+    """What is fixed stays where it is in the room."""
+    clamp = Clamp(CLAMP, np.zeros(3))
+    turn = Rotation.from_euler("z", -CLAMP[2])
+
+    def expected(points):
+        return turn.apply(points - [*CLAMP[:2], 0.0])
+
+    moved = TagMap.from_dict(at_clamp(yaml.safe_load((config / "tags.yaml").read_text()), clamp))
+    for old, new in zip(tags.world, moved.world, strict=True):
+        np.testing.assert_allclose(new.corners(), expected(old.corners()), atol=1e-12)
+    assert moved.limb == tags.limb
+
+    content = yaml.safe_load((config / "bodies.yaml").read_text())
+    content["frame"] = {"position": [0.4, -0.2, 0.9], "rotation": [0.1, 0.7, 0.1, 0.7]}
+    old, new = BodyMap.from_dict(content), BodyMap.from_dict(at_clamp(content, clamp))
+    for before, after in zip(old.fixed, new.fixed, strict=True):
+        np.testing.assert_allclose(after.position, expected(before.position), atol=1e-12)
+    np.testing.assert_allclose(new.fixed[0].rotation, turn.as_matrix(), atol=1e-12)
+    room = np.array([[0.3, 0.1, 0.2], [-1.0, 0.5, 0.0]])
+    np.testing.assert_allclose(new.frame.of(room), expected(old.frame.of(room)), atol=1e-12)

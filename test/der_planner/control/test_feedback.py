@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from limbs import of_pressures
+from limbs import of_pressures, with_segments
 from link_chain import LinkChain
 
 from der_planner.control import Feedback, Learner
@@ -105,15 +105,15 @@ def test_commands_keep_all_limits(planned, corrected):
 
 def test_a_limb_that_swings_otherwise_than_its_model_is_followed_and_not_made_worse():
     # Bends at rest are those of the chain, its file is four times too soft.
-    chain, segments = Chain().chain, []
-    for i, segment in enumerate(Limb.default().segments):
-        stiffness = 0.25 * segment.bending_stiffness
-        gain = chain._gain[i].mean() * (1.0 / chain._stiffness.reshape(2, -1)[i]).sum()
-        rest = chain._rest[i] / segment.length
-        changed = {"bending_stiffness": stiffness, "rest_curvature": rest}
-        gain *= stiffness / segment.length
-        segments.append(replace(segment, moment_gain=gain, **changed))
-    limb = replace(Limb.default(), segments=tuple(segments))
+    chain, segment = Chain().chain, Limb.default().segments[0]
+    stiffness = 0.25 * segment.bending_stiffness
+    bend = chain._gain.mean(axis=1) * (1.0 / chain._stiffness.reshape(2, -1)).sum(axis=1)
+    limb = with_segments(
+        Limb.default(),
+        bending_stiffness=stiffness,
+        rest_curvature=list(chain._rest / segment.length),
+        moment_gain=list(bend * stiffness / segment.length),
+    )
     fast = plan(limb, Motion.named("asynchronous", amplitude=0.6, period=6.0, cycles=1))
     alone, fed = (play(fast, Chain(), feedback) for feedback in (None, Feedback(fast)))
     assert fed.error.mean() < 1.02 * alone.error.mean()

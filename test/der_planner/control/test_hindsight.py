@@ -1,10 +1,13 @@
-"""What a recorded run shows afterwards, on a chain of links whose true motion is known."""
+"""What a recorded run shows afterwards, and what feedback takes the chambers to hold next."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from link_chain import TIP_NOISE, LinkChain
 
 from der_planner.control.hindsight import Filmed, Smoothed, smooth
+from der_planner.control.nominal import STEP, ChamberLog, Nominal
 from der_planner.limb import Limb
 from der_planner.planning import Motion, Plan, plan
 
@@ -67,3 +70,69 @@ def test_a_run_without_pictures_is_refused(planned):
     nothing = np.full((20, 2), np.nan)
     with pytest.raises(ValueError, match="no picture of the limb"):
         smooth(planned, Filmed(time, np.zeros((20, 2)), time, nothing, nothing))
+
+
+FALLS_BEHIND = 500.0
+"""[Pa/s]"""
+
+
+@pytest.fixture(scope="module")
+def nominal() -> Nominal:
+    """Return the motion of a plan of the default limb."""
+    motion = Motion.named("same_direction", amplitude=0.5, period=8.0, cycles=1)
+    return Nominal(plan(Limb.default(), motion, method="projected"))
+
+
+def ahead(nominal: Nominal, readings: int) -> float:
+    """Return how wrong the pressures 0.3 s ahead are [Pa] after so many readings until 2.6 s.
+
+    The real chambers fall behind their model by another `FALLS_BEHIND` each second.
+    """
+
+    def real(steps: np.ndarray) -> np.ndarray:
+        lag = FALLS_BEHIND * (STEP * (steps + 0.5) - 2.0)
+        return ChamberLog(nominal).model(steps) - lag[:, None]
+
+    log = ChamberLog(nominal)
+    for step in 259 - 5 * np.arange(readings)[::-1]:
+        log.read(STEP * (step + 0.5), real(np.array([step]))[0])
+    coming = np.array([289])
+    return float(np.abs(log.during(coming) - real(coming)).max())
+
+
+def test_chambers_that_fall_behind_are_expected_to_fall_behind_further(nominal):
+    assert ahead(nominal, 1) > 0.2 * FALLS_BEHIND
+    assert ahead(nominal, 7) < 0.4 * ahead(nominal, 1)
+
+
+def test_after_a_long_time_the_model_counts_again(nominal):
+    log = ChamberLog(nominal)
+    steps = np.arange(60)
+    for k in range(8):
+        log.read(0.05 * k, log.model(np.array([5 * k]))[0] + 200.0 + 300.0 * 0.05 * k)
+    gap = log.expected_gap(log.newest + np.array([0.0, 0.5, 20.0]))
+    assert gap[0] == pytest.approx(305.0, abs=2.0)
+    assert np.all(gap[1] > gap[0])
+    assert np.abs(gap[2]).max() < 200.0
+    assert np.isfinite(log.during(steps)).all()
+
+
+@pytest.mark.slow
+def test_what_a_learned_plan_knows_of_its_chambers_is_not_corrected_again():
+    motion = Motion.named("same_direction", amplitude=0.5, period=8.0, cycles=1)
+    planned = replace(plan(Limb.default(), motion, method="projected"), method="learned")
+    beyond = 200.0 + 5.0 * np.arange(len(planned.time))[:, None] * np.array([1.0, -1.0])
+    told = Nominal(replace(planned, chambers_beyond=beyond))
+    steps = np.arange(60)
+    news = {}
+    for name, nominal in (("told", told), ("not told", Nominal(planned))):
+        log = ChamberLog(nominal)
+        for k in range(8):
+            # Amid the first step of period k the chambers are a tenth of a period into it.
+            share = beyond[k] - 0.4 * (beyond[k + 1] - beyond[k])
+            log.read(STEP * (5 * k + 0.5), log.model(np.array([5 * k]))[0] + share + 30.0)
+        news[name] = log.during(steps) - log.model(steps)
+    # Only what is more than expected counts; nothing does where nobody told what to expect.
+    np.testing.assert_allclose(news["told"][:36], 30.0, atol=10.0)
+    assert np.abs(news["told"][40:] - 30.0).max() < 25.0
+    assert not news["not told"].any()

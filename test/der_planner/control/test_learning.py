@@ -115,13 +115,8 @@ def test_a_plan_that_is_expected_to_be_worse_is_not_played(first, monkeypatch):
 
 def test_arcs_learn_as_the_rod_does():
     motion = Motion.named("same_direction", period=8.0, cycles=1)
-    planned, errors = plan(LIMB, motion, model="pcc", method="paper"), []
-    learner = Learner(planned)
-    for _ in range(3):
-        tip = play(planned, other_limb())
-        errors.append(mean_error(planned, tip))
-        learner.add(planned.time, tip)
-        planned = learner.next()
+    first = plan(LIMB, motion, model="pcc", method="paper")
+    _, planned, errors = learn(first, other_limb(), 3)
     assert planned.model == "pcc"
     assert errors[2] < errors[0] / 3
 

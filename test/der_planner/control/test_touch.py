@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from limbs import with_segments
 
 from der_planner.control.force import untouched
 from der_planner.control.free_level import FreeLevel, Lacking
@@ -60,6 +61,25 @@ def frame(model, node, bend) -> np.ndarray:
     """Return the directions along and across the limb at a node, as columns."""
     heading = model.kinematics.turning[node - 1] @ bend
     return np.array([[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]])
+
+
+def looked(sense, felt, shares, begin=0.0, driven=0.0):
+    """Have shares of what a limb lacks looked at, 30 a second; return what is said of each.
+
+    The limb may be driven against it, by as much of its pressures as ``driven`` says.
+    """
+    against = driven * felt.value[:2]
+    return [
+        sense.look(
+            replace(
+                felt,
+                time=begin + k / 30,
+                value=share * felt.value,
+                effective=felt.effective - share * against,
+            )
+        )
+        for k, share in enumerate(shares)
+    ]
 
 
 @pytest.mark.parametrize("node", [10, 15, 20])
@@ -119,13 +139,9 @@ def test_doubt_ends_no_touch(model):
 
 def test_a_touch_ends_and_the_next_one_has_a_time_of_its_own(model):
     sense, hit = TouchSense(model, calibrated()), lacking(model, {20: (0.0, 0.2)})
-    nothing = replace(hit, value=np.zeros(4))
-    said = [
-        sense.look(replace(each, time=float(time)))
-        for time, each in enumerate([nothing, hit, hit, nothing, hit])
-    ]
+    said = looked(sense, hit, [0.0, 1.0, 1.0, 0.0, 1.0])
     assert [touch.touched for touch in said] == [False, True, True, False, True]
-    assert [touch.since for touch in said if touch.touched] == [1.0, 1.0, 4.0]
+    assert [30 * touch.since for touch in said if touch.touched] == pytest.approx([1, 1, 4])
     assert said[1].said
     assert not said[3].said
 
@@ -161,41 +177,26 @@ def test_a_stiffness_that_is_wrong_under_gravity_is_no_touch():
 def test_a_payload_is_weighed_and_what_the_limb_is_driven_against_is_not():
     tilted = RodModel(LIMB.mounted("20"))
     hung = lacking(tilted, {20: 0.06 * np.array(tilted.limb.gravity[:2])})
-
-    def watched(sense, begin, shares, driven=0.0):
-        more = driven * hung.value[:2]
-        return [
-            sense.look(
-                replace(
-                    hung,
-                    time=begin + k / 30,
-                    value=share * hung.value,
-                    effective=hung.effective - share * more,
-                )
-            )
-            for k, share in enumerate(shares)
-        ]
-
     sense = TouchSense(tilted, calibrated())
-    put_on = watched(sense, 0.0, np.repeat([0.0, 1.0], [5, 60]))
+    put_on = looked(sense, hung, np.repeat([0.0, 1.0], [5, 60]))
     assert put_on[8].touched
     assert put_on[8].weighed
     assert not put_on[-1].touched
     assert put_on[-1].payload == pytest.approx(0.06, rel=0.1)
     # Friction may have borne a part of it.
-    assert not any(touch.touched for touch in watched(sense, 2.2, np.full(10, 1.2)))
-    taken_off = watched(sense, 3.0, np.repeat([0.5, 0.0], [10, 20]))
+    assert not any(touch.touched for touch in looked(sense, hung, np.full(10, 1.2), 2.2))
+    taken_off = looked(sense, hung, np.repeat([0.5, 0.0], [10, 20]), 3.0)
     assert not taken_off[-1].touched
     assert taken_off[-1].payload == 0.0
     # A hand comes slowly, though pressures stay.
     shares = np.concatenate([np.linspace(0.0, 2.0, 60), np.full(40, 2.0)])
-    hand = watched(TouchSense(tilted, calibrated()), 0.0, shares)
+    hand = looked(TouchSense(tilted, calibrated()), hung, shares)
     assert hand[-1].touched
     assert not hand[-1].weighed
     assert hand[-1].payload == 0.0
     # Something fixed takes what the limb is driven with, and pushes as a payload pulls.
     reached = np.concatenate([np.linspace(0.0, 1.0, 20), np.ones(60)])
-    fixed = watched(TouchSense(tilted, calibrated()), 0.0, reached, driven=1.0)
+    fixed = looked(TouchSense(tilted, calibrated()), hung, reached, driven=1.0)
     assert fixed[-1].touched
     assert not any(touch.weighed for touch in fixed)
     assert fixed[-1].payload == 0.0
@@ -206,10 +207,7 @@ def test_a_payload_that_was_weighed_is_known_again():
     hung = lacking(tilted, {20: 0.02 * np.array(tilted.limb.gravity[:2])})
     sense = TouchSense(tilted, calibrated())
     shares = np.repeat([0.0, 1.0, 0.0, 1.0], [5, 60, 20, 5])
-    felt = [
-        sense.look(replace(hung, time=k / 30, value=share * hung.value))
-        for k, share in enumerate(shares)
-    ]
+    felt = looked(sense, hung, shares)
     assert felt[6].touched
     assert felt[64].payload == pytest.approx(0.02, rel=0.1)
     assert felt[84].payload == 0.0
@@ -219,11 +217,8 @@ def test_a_payload_that_was_weighed_is_known_again():
 
 def rubbing() -> RodModel:
     """Return a limb whose friction is worth 900 Pa."""
-    segments = [
-        replace(s, friction_moment=900.0 * s.moment_gain, friction_curvature=0.8)
-        for s in LIMB.segments
-    ]
-    return RodModel(replace(LIMB, segments=tuple(segments)))
+    friction = {"friction_moment": lambda s: 900.0 * s.moment_gain, "friction_curvature": 0.8}
+    return RodModel(with_segments(LIMB, **friction))
 
 
 def test_friction_that_is_larger_and_less_even_than_said_is_no_touch():

@@ -25,28 +25,24 @@ DAMPED = with_segments(Limb.default(), damping=8.0)
 
 
 def hidden_limb() -> Limb:
-    limb = DAMPED
-    factors = ((1.12, 0.35, 0.04), (0.9, -0.25, -0.03))
-    return replace(
+    gain = DAMPED.segments[0].moment_gain
+    limb = with_segments(
+        DAMPED,
+        moment_gain=[1.12 * gain, 0.9 * gain],
+        rest_curvature=[0.35, -0.25],
+        gain_asymmetry=[0.04, -0.03],
+        pressure_stiffening=4e-6,
+        creep_time=9.0,
+        coupling_before=0.03,
+        coupling_after=-0.02,
+        bending_stiffness=0.0175,
+    )
+    return with_segments(
         limb,
-        segments=tuple(
-            replace(
-                s,
-                moment_gain=factor * s.moment_gain,
-                rest_curvature=rest,
-                gain_asymmetry=asymmetry,
-                pressure_stiffening=4e-6,
-                friction_moment=300 * factor * s.moment_gain,
-                friction_curvature=0.12 / s.length,
-                creep_stiffness=400 * factor * s.moment_gain * s.length,
-                creep_time=9.0,
-                cubic_stiffness=0.06 * s.bending_stiffness * s.length**2,
-                coupling_before=0.03,
-                coupling_after=-0.02,
-                bending_stiffness=0.0175,
-            )
-            for s, (factor, rest, asymmetry) in zip(limb.segments, factors, strict=True)
-        ),
+        friction_moment=lambda s: 300 * s.moment_gain,
+        friction_curvature=lambda s: 0.12 / s.length,
+        creep_stiffness=lambda s: 400 * s.moment_gain * s.length,
+        cubic_stiffness=lambda s: 0.06 * s.bending_stiffness * s.length**2,
     )
 
 
@@ -164,9 +160,8 @@ def test_a_limb_that_fits_passes_the_check_and_a_changed_one_does_not(fitted):
     limb, _ = fitted
     assert check(limb, synthetic_log(hidden_limb(), seed=5, slow=True)).fits
     drifted = hidden_limb()
-    weaker = replace(drifted.segments[0], moment_gain=0.8 * drifted.segments[0].moment_gain)
-    changed_limb = replace(drifted, segments=(weaker, drifted.segments[1]))
-    verdict = check(limb, synthetic_log(changed_limb, slow=True))
+    gains = [share * s.moment_gain for share, s in zip((0.8, 1.0), drifted.segments, strict=True)]
+    verdict = check(limb, synthetic_log(with_segments(drifted, moment_gain=gains), slow=True))
     assert not verdict.fits
     assert any("gain of segment 0" in finding for finding in verdict.findings)
     assert not any("gain of segment 1" in finding for finding in verdict.findings)

@@ -157,13 +157,8 @@ def test_mass_is_told_where_stiffness_is_given():
     chain = LinkChain(2, (0.0, -1.7, 0.0))
     stiffness = [0.122 / np.sum(1.0 / part) for part in chain._stiffness.reshape(2, 7)]
     known = prior((0.0, -1.7, 0.0))
-    heavy = replace(
-        known,
-        segments=tuple(
-            replace(s, bending_stiffness=float(k), mass_per_length=1.25 * s.mass_per_length)
-            for s, k in zip(known.segments, stiffness, strict=True)
-        ),
-    )
+    heavier = with_segments(known, mass_per_length=lambda s: 1.25 * s.mass_per_length)
+    heavy = with_segments(heavier, bending_stiffness=[float(each) for each in stiffness])
     limb, report = fit(heavy, chain_log((0.0, -1.7, 0.0), seed=2), terms=(*TERMS, "mass"))
     assert [s.bending_stiffness for s in limb.segments] == pytest.approx(stiffness)
     assert limb.moving_mass == pytest.approx(1.066 * 0.244, rel=0.1)

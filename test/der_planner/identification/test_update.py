@@ -1,6 +1,5 @@
 """A limb file brought up to date from ordinary runs, with what they tell and no more."""
 
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -23,18 +22,15 @@ RUBBING = with_segments(
 
 def another_day(limb, gain=(1.0, 1.0), rest=(0.0, 0.0), friction=(1.0, 1.0)):
     """Return a limb whose gains, rest angles [rad] and frictions have changed."""
-    segments = zip(limb.segments, gain, rest, friction, strict=True)
-    return replace(
+    return with_segments(
         limb,
-        segments=tuple(
-            replace(
-                s,
-                moment_gain=s.moment_gain * g,
-                rest_curvature=s.rest_curvature + r / s.length,
-                friction_moment=s.friction_moment * f,
-            )
-            for s, g, r, f in segments
-        ),
+        moment_gain=[s.moment_gain * g for s, g in zip(limb.segments, gain, strict=True)],
+        rest_curvature=[
+            s.rest_curvature + r / s.length for s, r in zip(limb.segments, rest, strict=True)
+        ],
+        friction_moment=[
+            s.friction_moment * f for s, f in zip(limb.segments, friction, strict=True)
+        ],
     )
 
 
@@ -138,24 +134,27 @@ def test_what_gain_rest_and_friction_do_not_explain_asks_for_a_calibration():
     assert not other.enough
 
 
-def test_the_command_writes_a_new_file_and_never_the_old_one(tmp_path, monkeypatch, capsys):
+def test_the_command_writes_a_new_file_and_never_the_old_one(tmp_path, call):
     changed = another_day(RUBBING, (0.6, 1.4), (0.05, -0.05))
     log, today = filmed(changed, *motion()), numbers(changed)
     old, new = tmp_path / "limb.yaml", tmp_path / "today.yaml"
     RUBBING.to_yaml(old)
     write_csv(log.between(0.0, 15.0), tmp_path / "log.csv", tmp_path / "columns.yaml")
     before = old.read_bytes()
-    given = ["--columns", tmp_path / "columns.yaml", "--limb", old]
+    columns = ("--columns", tmp_path / "columns.yaml")
+    given = (*columns, "--limb", old)
 
-    def call(*arguments):
-        monkeypatch.setattr(sys, "argv", ["check_limb.py", *map(str, arguments)])
-        return check_limb.main()
-
-    assert call(tmp_path / "log.csv", *given) == 3
-    assert call("--update", tmp_path / "log.csv", *given) == 0
-    assert "nothing was written" in capsys.readouterr().out
-    assert call("--update", tmp_path / "log.csv", *given, "--out", old) == 2
+    assert call(check_limb, tmp_path / "log.csv", *given)[0] == 3
+    code, said, _ = call(check_limb, "--update", tmp_path / "log.csv", *given)
+    assert code == 0
+    assert "nothing was written" in said
+    assert call(check_limb, "--update", tmp_path / "log.csv", *given, "--out", old)[0] == 2
     assert old.read_bytes() == before
-    assert call("--update", tmp_path / "log.csv", *given, "--out", new) == 0
+    assert call(check_limb, "--update", tmp_path / "log.csv", *given, "--out", new)[0] == 0
     assert numbers(Limb.from_yaml(new))[:, 0] == pytest.approx(today[:, 0], rel=0.03)
-    assert call(tmp_path / "log.csv", "--columns", tmp_path / "columns.yaml", "--limb", new) == 0
+    assert (
+        call(
+            check_limb, tmp_path / "log.csv", "--columns", tmp_path / "columns.yaml", "--limb", new
+        )[0]
+        == 0
+    )

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from limbs import with_air
 
 from der_planner.limb import VENT_REFERENCE, Limb
 from der_planner.model import Model, commands
@@ -16,7 +17,7 @@ LIMB = Limb.default()
 
 def slow(**air):
     values = {"time_constant": 0.3, "vent_time_constant": 0.13, "vent_rate": 5300.0, **air}
-    return dataclasses.replace(LIMB, pneumatics=dataclasses.replace(LIMB.pneumatics, **values))
+    return with_air(LIMB, **values)
 
 
 @pytest.mark.parametrize("exponent", [0.5, 2 / 3, 1.0])

@@ -1,4 +1,4 @@
-"""Unequal chambers, stiffening, friction and creep as pressures."""
+"""Unequal chambers, stiffening, friction and creep as pressures; how a limb gives way to forces."""
 
 from dataclasses import replace
 
@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from limbs import with_segments
 
-from der_planner.limb import Limb, LimbError
-from der_planner.model.material import Material, dahl, maxwell
+from der_planner.limb import Limb
+from der_planner.model import RodModel
+from der_planner.model.compliance import compliance
+from der_planner.model.material import Material
 
 
 def felt(limb, differential, bend):
@@ -37,33 +39,42 @@ BEND = 0.6 * np.stack([np.sin(TIME / 3), np.cos(TIME / 2) - 1], axis=1)
 WANTED = 11_000.0 * np.stack([np.sin(TIME / 3), np.sin(TIME / 5)], axis=1)
 
 
+def law(limb, differential, time, angles):
+    """Effective pressures (K, M) [Pa], instant by instant, as the page writes the law."""
+    result = np.empty_like(differential)
+    z, q = np.zeros(2), np.zeros(2)
+    for k in range(len(time)):
+        for i, s in enumerate(limb.segments):
+            if k:
+                turned = angles[k, i] - angles[k - 1, i]
+                side = 1.0 if turned >= 0 else -1.0
+                fade = np.exp(-abs(turned) / (s.friction_curvature * s.length))
+                z[i] = side - (side - z[i]) * fade
+                elapsed = (time[k] - time[k - 1]) / s.creep_time
+                filled = (1 - np.exp(-elapsed)) / elapsed
+                q[i] = q[i] * np.exp(-elapsed) + turned / s.length * filled
+            own, other = differential[k, i], differential[k, 1 - i]
+            share = s.coupling_after if i == 0 else s.coupling_before
+            driven = own * (1 + s.gain_asymmetry * np.sign(own)) + share * other
+            held = (s.friction_moment * z[i] + s.creep_stiffness * q[i]) / s.moment_gain
+            result[k, i] = (driven - held) / (1 + s.pressure_stiffening * abs(own))
+    return result
+
+
+def test_pressures_are_felt_by_the_law():
+    # The first segment has none before it, the last none after it.
+    coupling = {"coupling_before": [0.3, 0.04], "coupling_after": [-0.03, 0.2]}
+    limb = with_segments(rubbing(), gain_asymmetry=[0.05, -0.04], **coupling)
+    expected = law(limb, WANTED, TIME, BEND)
+    np.testing.assert_allclose(felt(limb, WANTED, BEND), expected, atol=1e-7)
+    assert np.abs(expected - WANTED).max() > 300.0
+
+
 def test_differential_and_effective_pressure_are_inverse():
     limb = rubbing()
     given = Material(limb).differential_pressure(TIME, WANTED, BEND)
     np.testing.assert_allclose(felt(limb, given, BEND), WANTED, atol=1e-8)
     assert np.abs(given - WANTED).max() > 300.0
-
-
-def test_friction_saturates_closes_its_loops_and_does_not_depend_on_rate():
-    angle = np.concatenate(
-        [np.linspace(0, 2, 400), np.linspace(2, -2, 800), np.linspace(-2, 2, 800)]
-    )
-    z = dahl(angle, 0.1)
-    assert np.abs(z).max() <= 1.0
-    assert z[399] == pytest.approx(1.0, abs=1e-6)
-    assert z[1199] == pytest.approx(-1.0, abs=1e-6)
-    np.testing.assert_allclose(z[-1], z[399], atol=1e-6)
-    np.testing.assert_allclose(dahl(angle[::4], 0.1)[-1], z[-1], atol=1e-6)
-    # half way round after 0.1 ln 2 from saturation
-    turned = dahl(np.array([0.0, 5.0, 5.0 - 0.1 * np.log(2)]), 0.1)
-    assert turned[-1] == pytest.approx(0.0, abs=1e-12)
-
-
-def test_creep_relaxes_exponentially():
-    time = np.linspace(0, 20, 401)
-    strain = np.where(time > 0, 1.0, 0.0)
-    q = maxwell(time, strain, 4.0)
-    np.testing.assert_allclose(q[1:], q[1] * np.exp(-(time[1:] - time[1]) / 4.0), rtol=1e-12)
 
 
 def test_resting_bend_is_where_moment_and_effective_pressure_agree():
@@ -95,22 +106,6 @@ def test_the_bend_at_rest_changes_as_the_difference_of_two(name, mounting):
     assert np.quantile(off, 0.95) < 0.02 * np.abs(expected).max()
 
 
-def test_coupling_adds_the_share_of_the_neighbours_pressure():
-    limb = Limb.default()
-    first, second = limb.segments
-    coupled = replace(
-        limb,
-        segments=(replace(first, coupling_after=0.04), replace(second, coupling_before=-0.02)),
-    )
-    found = felt(coupled, WANTED, BEND)
-    expected = WANTED + WANTED[:, ::-1] * [0.04, -0.02]
-    np.testing.assert_allclose(found, expected, rtol=1e-12)
-    alone = replace(limb, segments=(replace(first, coupling_before=0.04), second))
-    np.testing.assert_array_equal(felt(alone, WANTED, BEND), WANTED)
-    with pytest.raises(LimbError, match="coupling_after"):
-        replace(limb, segments=(replace(first, coupling_after=0.6), second))
-
-
 def test_too_much_stiffening_is_refused_by_its_name():
     limb = with_segments(rubbing(), pressure_stiffening=1e-4)
     with pytest.raises(ValueError, match="pressure_stiffening"):
@@ -123,3 +118,58 @@ def test_limb_file_keeps_everything(tmp_path):
     limb.to_yaml(tmp_path / "limb.yaml")
     assert Limb.from_yaml(tmp_path / "limb.yaml") == limb
     assert limb.for_model("pcc").segments == limb.pcc_segments
+
+
+LIMB = replace(Limb.default(), connector_length=0.0, base_length=0.0)
+LENGTH = LIMB.length
+EI = LIMB.segments[0].bending_stiffness
+
+
+@pytest.fixture(scope="module")
+def model():
+    return RodModel(LIMB, nodes=81)
+
+
+@pytest.mark.parametrize("share", [0.4, 0.75, 1.0])
+def test_a_force_across_a_straight_limb(model, share):
+    """Euler-Bernoulli: a³/3EI where it acts, a²(3L − a)/6EI at the tip, turned by a²/2EI."""
+    at = share * LENGTH
+    found = compliance(model, [0.0, 0.0], [at])
+    assert found.place[0, 1, 1] == pytest.approx(at**3 / (3 * EI), rel=5e-3)
+    assert found.tip[0, 1, 1] == pytest.approx(at**2 * (3 * LENGTH - at) / (6 * EI), rel=5e-3)
+    assert found.bend[0, :, 1].sum() == pytest.approx(at**2 / (2 * EI), rel=5e-3)
+    # A force along a straight limb does nothing to first order.
+    np.testing.assert_allclose(found.tip[0, :, 0], 0.0, atol=1e-12)
+
+
+def test_pressures_bend_as_the_gains_say(model):
+    found = compliance(model, [0.0, 0.0], [0.5 * LENGTH])
+    np.testing.assert_allclose(found.bend_by_pressure, np.diag(LIMB.static_gain), rtol=2e-3)
+
+
+def test_a_bent_limb_gives_way_as_the_rod_does():
+    model = RodModel(LIMB)
+    pressure = np.array([9000.0, -4000.0])
+    at_rest = model.resting(pressure)
+    node, force = 13, np.array([0.01, -0.02])
+    forces = np.zeros((model.nodes, 3))
+    forces[node, :2] = force
+    pushed = model.rod.equilibrium(pressure, start=at_rest, forces=forces)
+    place = float(np.cumsum(model.rod.rest_lengths)[node - 1])
+    bend = model.bend_of(at_rest)
+    found = compliance(model, bend, [place])
+    np.testing.assert_allclose(found.tip[0] @ force, (pushed.q - at_rest.q)[-3:-1], rtol=0.03)
+    np.testing.assert_allclose(found.bend[0] @ force, model.bend_of(pushed) - bend, rtol=0.03)
+
+
+def test_a_force_across_the_tip_of_a_bent_limb(model):
+    """Of a circular arc: F / EI ∫ arm² ds, with the arms along the tip's own heading."""
+    bend = np.array([0.4, 0.4])
+    found = compliance(model, bend, [LENGTH])
+    across = np.array([-np.sin(0.8), np.cos(0.8)])
+    s = np.linspace(0.0, LENGTH, 20001)
+    radius = LENGTH / 0.8
+    x, y = radius * np.sin(s / radius), radius * (1 - np.cos(s / radius))
+    arm = (x[-1] - x) * np.cos(0.8) + (y[-1] - y) * np.sin(0.8)
+    expected = np.sum(0.5 * (arm[1:] ** 2 + arm[:-1] ** 2)) * s[1] / EI
+    assert across @ found.tip[0] @ across == pytest.approx(expected, rel=0.02)

@@ -1,4 +1,4 @@
-"""`simulate`: values against laws written out here, derivatives against finite differences.
+"""`simulate`: values against the laws of air and material, derivatives against finite differences.
 
 Every term of air and material is on: a friction that turns round over a bend 10 % off, or a lag
 that is forgotten, breaks these tests.
@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from limbs import with_segments
+from limbs import with_air, with_segments
 
 from der_planner.limb import VENT_REFERENCE, Limb
 from der_planner.model import CONTROL_PERIOD, STEPS, Initial, Material, Model, RodModel, simulate
@@ -16,33 +16,23 @@ from der_planner.model.bending import bend_angles
 
 
 def everything() -> Limb:
-    limb = Limb.default()
-    shares = ((0.05, 0.3, 0.03), (-0.04, -0.2, -0.02))
-    segments = tuple(
-        replace(
-            s,
-            gain_asymmetry=asymmetry,
-            pressure_stiffening=4e-6,
-            rest_curvature=rest,
-            cubic_stiffness=0.06 * s.bending_stiffness * s.length**2,
-            material_damping=0.01,
-            friction_moment=400 * s.moment_gain,
-            friction_curvature=0.12 / s.length,
-            creep_stiffness=500 * s.moment_gain * s.length,
-            creep_time=8.0,
-            coupling_before=coupling,
-            coupling_after=-coupling,
-        )
-        for s, (asymmetry, rest, coupling) in zip(limb.segments, shares, strict=True)
+    limb = with_air(
+        Limb.default(), time_constant=0.3, vent_time_constant=0.13, delay=0.03, vent_rate=5300.0
     )
-    air = replace(
-        limb.pneumatics,
-        time_constant=0.3,
-        vent_time_constant=0.13,
-        delay=0.03,
-        vent_rate=5300.0,
+    return with_segments(
+        limb,
+        gain_asymmetry=[0.05, -0.04],
+        pressure_stiffening=4e-6,
+        rest_curvature=[0.3, -0.2],
+        cubic_stiffness=lambda s: 0.06 * s.bending_stiffness * s.length**2,
+        material_damping=0.01,
+        friction_moment=lambda s: 400 * s.moment_gain,
+        friction_curvature=lambda s: 0.12 / s.length,
+        creep_stiffness=lambda s: 500 * s.moment_gain * s.length,
+        creep_time=8.0,
+        coupling_before=[0.03, -0.02],
+        coupling_after=[-0.03, 0.02],
     )
-    return replace(limb, segments=segments, pneumatics=air)
 
 
 LIMB = everything()
@@ -73,34 +63,15 @@ def integrated_chambers(commands):
     return result
 
 
-def felt(differential, time, angles):
-    """The material's law, instant by instant, as its page writes it."""
-    result = np.empty_like(differential)
-    z, q = np.zeros(2), np.zeros(2)
-    for k in range(len(time)):
-        for i, s in enumerate(LIMB.segments):
-            if k:
-                turned = angles[k, i] - angles[k - 1, i]
-                side = 1.0 if turned >= 0 else -1.0
-                fade = np.exp(-abs(turned) / (s.friction_curvature * s.length))
-                z[i] = side - (side - z[i]) * fade
-                elapsed = (time[k] - time[k - 1]) / s.creep_time
-                filled = (1 - np.exp(-elapsed)) / elapsed
-                q[i] = q[i] * np.exp(-elapsed) + turned / s.length * filled
-            own, other = differential[k, i], differential[k, 1 - i]
-            share = s.coupling_after if i == 0 else s.coupling_before
-            driven = own * (1 + s.gain_asymmetry * np.sign(own)) + share * other
-            held = (s.friction_moment * z[i] + s.creep_stiffness * q[i]) / s.moment_gain
-            result[k, i] = (driven - held) / (1 + s.pressure_stiffening * abs(own))
-    return result
-
-
 def test_commands_become_pressures_and_shape_by_the_laws():
     response = simulate(LIMB, TIME, commands=COMMANDS, bend=bend)
     differential = response.differential_pressure.reshape(-1, 2)
     assert np.abs(differential - integrated_chambers(COMMANDS)).max() < 25.0
     middle = (np.arange(COUNT * STEPS) + 0.5) * 0.01
-    effective = felt(differential, middle, bend(middle))
+    material = Material(LIMB)
+    effective = material.without_memory(
+        differential, material.memory_pressures(middle, bend(middle))
+    )
     np.testing.assert_allclose(response.effective_pressure.reshape(-1, 2), effective, atol=1e-7)
     model = RodModel(LIMB)
     moved = model.rod.simulate(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import signal
-import socket
 import sys
 import threading
 from collections.abc import Iterator
@@ -17,7 +16,7 @@ from urllib.error import URLError
 from urllib.request import Request, urlopen
 
 import pytest
-from domain import own_domain
+from domain import free_port, own_domain
 from waiting import wait_for
 from websockets.sync.client import connect
 
@@ -35,9 +34,7 @@ class Visitor:
     """Looks at the page at a port as a browser does."""
 
     def __init__(self) -> None:
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            self.port = free.getsockname()[1]
+        self.port = free_port()
         self._headers = {"Cookie": f"limb_token_{self.port}={PAGE_TOKEN}"}
 
     def get(self, path: str) -> str:

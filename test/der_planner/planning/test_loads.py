@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from limbs import with_segments
+from limbs import with_air, with_segments
 
 from der_planner.limb import GRAVITY, Limb
 from der_planner.model import RodModel
@@ -169,10 +169,7 @@ def test_a_leaning_limb_beyond_its_critical_load_is_refused_by_name(model):
 @pytest.mark.parametrize(("model", "amplitude"), [("der", 2.0), ("pcc", 2.6)])
 def test_a_pose_that_would_snap_through_is_named(model, amplitude):
     """A soft limb that is bent far up against its weight falls over at some point."""
-    limb = stiffer(LIMB, 0.1).mounted("hanging")
-    limb = dataclasses.replace(
-        limb, pneumatics=dataclasses.replace(limb.pneumatics, pressure_limit=1e7)
-    )
+    limb = with_air(stiffer(LIMB, 0.1).mounted("hanging"), pressure_limit=1e7)
     with pytest.raises(BucklingError, match="snap through"):
         plan(limb, Motion.named("same_direction", amplitude, 20.0, 1), model, "projected")
 

@@ -71,15 +71,13 @@ def test_run_of_a_bag(folder: Path):
 def test_a_board_with_crossed_hoses_receives_every_setpoint(tmp_path: Path):
     bag = BagOfRun(tmp_path / "run", run=json.dumps({"wiring": [2, 0, 3, 1]}))
     write_run(bag, valves=(2, 0, 3, 1))
-    bag.bag.close()
-    assert evaluate_run(load_run(tmp_path / "run")).checks["board_lost"] == 0
+    assert evaluate_run(load_run(bag.bag.close())).checks["board_lost"] == 0
 
 
 def test_times_come_from_the_setpoints_not_from_arrival_or_plan(tmp_path: Path):
     bag = BagOfRun(tmp_path / "run")
     write_run(bag, first_setpoint=-3.0)  # the plan's own stamp is off by 3 s
-    bag.bag.close()
-    assert evaluate_run(load_run(tmp_path / "run")).mean_error_m == pytest.approx(0.005, abs=3e-5)
+    assert evaluate_run(load_run(bag.bag.close())).mean_error_m == pytest.approx(0.005, abs=3e-5)
 
 
 @pytest.mark.parametrize("storage", [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
@@ -127,8 +125,7 @@ def test_what_was_not_yet_measured_is_left_out(tmp_path: Path):
         bag.pressure(TIMES[index], [100.0, 100.0], measured)
     for index, when in enumerate(FRAMES):
         bag.state(when, reference(when)[0], valid=index != 50)
-    bag.bag.close()
-    run = load_run(tmp_path / "run")
+    run = load_run(bag.bag.close())
     assert np.isnan(run.measured.value[:11]).all()
     assert np.isnan(run.bend_angle.value[50]).all()
     assert np.allclose(np.delete(run.bend_angle.value, 50, axis=0), [0.1, 0.2])
@@ -147,8 +144,7 @@ def test_interrupted_run_says_so(tmp_path: Path):
     bag.pressure(1.5, [0, 0], [0, 0], mode=5, faults=["serial line lost"])
     for when, distance, said in ((0.9, 2.0, "0.2 N"), (1.0, 9.0, "0.3 N"), (1.1, 4.0, "0.4 N")):
         bag.touch(when, 0.8, distance, said)
-    bag.bag.close()
-    result = evaluate_run(load_run(tmp_path / "run"))
+    result = evaluate_run(load_run(bag.bag.close()))
     assert any("serial line lost" in text for text in result.problems)
     touched = [text for text in result.problems if "touched" in text]
     assert touched == ["something touched the limb from 0.80 s on, 0.3 N"]
@@ -252,7 +248,6 @@ def test_the_last_revision_of_a_setpoint_counts(tmp_path: Path):
         bag.pressure(time, [1500.0, -1500.0], [1500.0, -1500.0])
         bag.command(time + 0.004, [1500.0, -1500.0], index)
         bag.state(time + 0.01, reference(time + 0.01)[0])
-    bag.bag.close()
-    result = evaluate_run(load_run(tmp_path / "run"))
+    result = evaluate_run(load_run(bag.bag.close()))
     assert result.checks["board_lost"] == 0
     assert result.extra["feedback"]["correction_max_pa"] == [1500.0, 1500.0]

@@ -1,7 +1,6 @@
 """The commands on bags, as people call them."""
 
 import json
-import sys
 from pathlib import Path
 
 import pytest
@@ -16,17 +15,6 @@ from der_planner.planning import Motion, plan
 pytestmark = pytest.mark.slow
 
 
-@pytest.fixture
-def run(monkeypatch, capsys):
-    """Return what calls a command's main and returns its exit code, stdout and stderr."""
-
-    def call(command, *arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", [command.__name__, *map(str, arguments)])
-        return command.main(), *capsys.readouterr()
-
-    return call
-
-
 @pytest.fixture(scope="module")
 def experiment(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("experiment")
@@ -36,9 +24,9 @@ def experiment(tmp_path_factory) -> Path:
     return folder
 
 
-def test_evaluate_an_experiment_and_a_bag_that_is_none(run, experiment: Path, tmp_path: Path):
+def test_evaluate_an_experiment_and_a_bag_that_is_none(call, experiment: Path, tmp_path: Path):
     missing = tmp_path / "missing"
-    code, said, complaint = run(evaluate, experiment, missing, "--results", tmp_path)
+    code, said, complaint = call(evaluate, experiment, missing, "--results", tmp_path)
     assert code == 1
     assert f"error: no bag at {missing}" in complaint
     assert "0.60 cm less error" in said
@@ -50,18 +38,18 @@ def test_evaluate_an_experiment_and_a_bag_that_is_none(run, experiment: Path, tm
     }
 
 
-def test_recover_says_what_it_did(run, experiment: Path):
+def test_recover_says_what_it_did(call, experiment: Path):
     bag = experiment / "bags" / "der"
     file = bag / "der_0.mcap"
     file.write_bytes(file.read_bytes()[:-40])
-    code, said, complaint = run(recover, bag, bag.parent / "pcc", bag / "missing")
+    code, said, complaint = call(recover, bag, bag.parent / "pcc", bag / "missing")
     assert code == 1
     assert f"saved in {bag}_recovered; lost: " in said
     assert "whole, nothing to recover" in said
     assert "missing" in complaint
 
 
-def test_what_touched_a_recorded_limb_is_told(run, tmp_path: Path):
+def test_what_touched_a_recorded_limb_is_told(call, tmp_path: Path):
     planned, chain = plan(Limb.default(), Motion.named("same_direction", 0.3, 6.0, 1)), LinkChain(3)
     planned.limb.to_yaml(tmp_path / "limb.yaml")
     bag = BagOfRun(tmp_path / "bag", run=json.dumps({"trial": 1, "seed": 1}))
@@ -78,6 +66,6 @@ def test_what_touched_a_recorded_limb_is_told(run, tmp_path: Path):
         chain.advance(command, 0.05)
     bag.bag.close()
     limb = ("--limb", tmp_path / "limb.yaml")
-    code, said, complaint = run(evaluate, tmp_path / "bag", "--contact", *limb)
+    code, said, complaint = call(evaluate, tmp_path / "bag", "--contact", *limb)
     assert code == 0, complaint
     assert "touched from 5." in said

@@ -1,4 +1,4 @@
-"""The page, the figures over camera frames and the film, from bags with images."""
+"""The page, its figures, those over camera frames and the film, from runs and bags with images."""
 
 import csv
 import json
@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from filmed import FilmedRun, pixels
+from matplotlib.figure import Figure
 from runs import FRAMES, TIMES, BagOfRun, reference, series
 
 from der_planner.bags.reader import BagReader
@@ -18,6 +18,13 @@ from der_planner.results import (
     evaluate_run,
     load_run,
     write_report,
+)
+from der_planner.results.figures import (
+    COLUMN,
+    colours_of,
+    mean_error,
+    paper_style,
+    shared_legend,
 )
 from der_planner.results.overlay import plot_shapes, write_video
 from der_planner.results.report import document
@@ -131,3 +138,81 @@ def test_bag_without_images_has_shapes_but_no_film(tmp_path: Path):
     with pytest.raises(EvaluationError, match="no camera calibration"):
         write_video(loaded, tmp_path / "film.mp4")
     assert plot_shapes([series(reference(FRAMES))], tmp_path) == []
+
+
+CAMERA = np.array([[300.0, 0.0, 158.0], [0.0, 305.0, 121.0], [0.0, 0.0, 1.0]])
+DISTORTION = np.array([-0.12, 0.03, 0.001, -0.0005, 0.0])
+ROTATION = np.array([0.05, 3.08, 0.1])
+POSITION = np.array([0.1, 0.02, 0.55])
+HEIGHT = 0.03
+
+
+def pixels(points: np.ndarray) -> np.ndarray:
+    """Project points (N, 2) [m] of the plane of the tags with OpenCV's camera model."""
+    lifted = np.column_stack([points, np.full(len(points), HEIGHT)])
+    return cv2.projectPoints(lifted, ROTATION, POSITION, CAMERA, DISTORTION)[0][:, 0, :]
+
+
+TAGS = "der_msgs/msg/TagDetectionArray"
+
+
+class FilmedRun(BagOfRun):
+    """A run with camera and tags."""
+
+    def __init__(self, folder: Path, **options) -> None:
+        super().__init__(folder, types=(TAGS,), **options)
+
+    def frame(self, seconds: float, shade: int) -> None:
+        data = np.full(240 * 320, shade, dtype=np.uint8)
+        about = {"height": 240, "width": 320, "encoding": "mono8", "step": 320}
+        self.write("/limb/camera/image_raw", "sensor_msgs/msg/Image", seconds, data=data, **about)
+
+    def calibration(self, matrix: np.ndarray = CAMERA) -> None:
+        about = {"height": 240, "width": 320, "distortion_model": "plumb_bob"}
+        name = "sensor_msgs/msg/CameraInfo"
+        self.write("/limb/camera/camera_info", name, 0.0, d=DISTORTION, k=matrix.ravel(), **about)
+
+    def tags(self, seconds: float, centres: np.ndarray) -> None:
+        square = 0.01 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+        detections = [
+            self.make(
+                "der_msgs/msg/TagDetection",
+                id=i,
+                corners=pixels(centre + square).ravel(),
+                on_limb=True,
+                pose_valid=True,
+                pose=self.make("geometry_msgs/msg/Pose2D", x=centre[0], y=centre[1]),
+            )
+            for i, centre in enumerate(centres)
+        ]
+        self.write("/limb/tags", TAGS, seconds, detections=detections)
+
+
+def test_mean_error_over_trials_ignores_gaps():
+    one = series(reference(FRAMES) + np.array([0.0, 0.002]))
+    tip = reference(FRAMES) + np.array([0.0, 0.006])
+    tip[(FRAMES > 3.0) & (FRAMES < 4.0)] = np.nan
+    two = series(tip, trial=1)
+    time, mean, deviation = mean_error([one, two])
+    both = (time < 2.8) | (time > 4.2)
+    alone = (time > 3.2) & (time < 3.8)
+    assert np.allclose(mean[both], 0.004, atol=5e-5)
+    assert np.allclose(deviation[both], np.std([0.002, 0.006], ddof=1), atol=5e-5)
+    assert np.allclose(mean[alone], 0.002, atol=5e-5)
+    assert np.all(deviation[alone] == 0)
+
+
+def test_methods_of_a_model_are_told_apart_in_a_legend_that_is_whole():
+    runs = [series(reference(FRAMES), method=f"optimal, learned {n}") for n in range(5)]
+    colours = colours_of(runs)
+    assert len(set(colours.values())) == 5
+    with paper_style():
+        figure = Figure(figsize=(COLUMN, 2.2))
+        axis = figure.subplots()
+        for label, colour in colours.items():
+            axis.plot([0.0, 1.0], color=colour, label=label)
+        shared_legend(figure, [axis])
+        figure.canvas.draw()
+        drawn = figure.legends[0].get_window_extent()
+        assert drawn.x0 >= 0.0
+        assert drawn.x1 <= figure.bbox.x1

@@ -4,25 +4,22 @@ import dataclasses
 
 import numpy as np
 import pytest
+from limbs import with_segments
 
 from der_planner.limb import Limb
 from der_planner.model.bending import PolylineKinematics, bend_angles
 from der_planner.rod import ConvergenceError, Rod
 
 
-def changed(*segments, **limb_options) -> Limb:
-    limb = Limb.default()
-    parts = [
-        dataclasses.replace(segment, **options)
-        for segment, options in zip(limb.segments, segments, strict=True)
-    ]
-    return dataclasses.replace(limb, segments=tuple(parts), **limb_options)
+def joined(connector: float) -> Limb:
+    """Return the default limb with another length of what joins its segments [m]."""
+    return dataclasses.replace(Limb.default(), connector_length=connector)
 
 
 @pytest.mark.parametrize("nodes", [11, 20, 21, 22, 40])
 @pytest.mark.parametrize("connector", [0.0, 0.01])
 def test_mesh_covers_the_limb(nodes, connector):
-    limb = changed({"length": 0.1}, {"length": 0.15}, connector_length=connector)
+    limb = with_segments(joined(connector), length=[0.1, 0.15])
     rod = Rod.from_limb(limb, nodes)
     assert rod.nodes == nodes
     assert rod.plane == "xy"
@@ -37,10 +34,12 @@ def test_mesh_covers_the_limb(nodes, connector):
 
 @pytest.mark.parametrize("connector", [0.0, 0.015])
 def test_static_bend_angles_are_those_of_the_segments(connector):
-    limb = changed(
-        {"length": 0.1, "bending_stiffness": 0.02, "rest_curvature": 0.8},
-        {"length": 0.15, "moment_gain": 7e-6, "rest_curvature": -0.5},
-        connector_length=connector,
+    limb = with_segments(
+        joined(connector),
+        length=[0.1, 0.15],
+        bending_stiffness=[0.02, 0.0175],
+        moment_gain=[9.1e-6, 7e-6],
+        rest_curvature=[0.8, -0.5],
     )
     rod = Rod.from_limb(limb)
     u = np.array([4e3, -6e3])
@@ -52,7 +51,7 @@ def test_static_bend_angles_are_those_of_the_segments(connector):
 
 
 def test_a_short_connector_does_not_keep_a_curved_limb_from_its_rest():
-    limb = changed({"rest_curvature": -3.0}, {"rest_curvature": -1.0}, connector_length=5e-4)
+    limb = with_segments(joined(5e-4), rest_curvature=[-3.0, -1.0])
     rod = Rod.from_limb(limb, 13)
     found = bend_angles(rod, rod.equilibrium(np.zeros(2)).q)
     np.testing.assert_allclose(found, [-3.0 * 0.122, -0.122], rtol=1e-6)
@@ -60,7 +59,7 @@ def test_a_short_connector_does_not_keep_a_curved_limb_from_its_rest():
 
 def test_cubic_stiffness_is_the_segments_law():
     stiffening = 2e-5
-    limb = changed({"cubic_stiffness": stiffening}, {"cubic_stiffness": stiffening})
+    limb = with_segments(Limb.default(), cubic_stiffness=stiffening)
     rod = Rod.from_limb(limb, 41)
     u = np.array([1e4, -1.5e4])
     curvature = bend_angles(rod, rod.equilibrium(u).q) / 0.122
@@ -70,8 +69,7 @@ def test_cubic_stiffness_is_the_segments_law():
 
 
 def test_gravity_out_of_the_plane_makes_the_rod_spatial():
-    limb = changed({}, {}, gravity=(0.0, 0.0, -9.81))
-    rod = Rod.from_limb(limb)
+    rod = Rod.from_limb(dataclasses.replace(Limb.default(), gravity=(0.0, 0.0, -9.81)))
     assert rod.plane is None
     sagging = rod.equilibrium([8e3, 8e3])
     assert rod.tip(sagging)[2] < -0.005
