@@ -289,7 +289,8 @@ def simulate(
 
     It is stable whatever the step h [s], also where material damping is large, and lets motion die
     down that is too fast for the step (Hairer and Wanner, Solving Ordinary Differential Equations
-    II, IV.5). A step in which Newton's method fails is taken in 2, 4, 8 … parts.
+    II, IV.5). A step in which Newton's method fails, or that is too long for its motion, is taken
+    in 2, 4, 8 … parts.
 
     pressures (K, S, n) [Pa] are constant over each of the S steps of an interval. Returns angles
     and rates (K + 1, n) at the interval boundaries, NaN from where a step was not found.
@@ -313,8 +314,9 @@ def simulate(
                 found, q_part, v_part, by = _step(
                     q_part, v_part, torque, h / parts, a, arcs, linearise
                 )
-                dx = by[:, : 2 * n] @ dx
-                dx[:, 2 * n :] += by[:, 2 * n :]
+                if linearise:
+                    dx = by[:, : 2 * n] @ dx
+                    dx[:, 2 * n :] += by[:, 2 * n :]
                 done += 1
                 if not found:
                     parts, done = 2 * parts, 0
