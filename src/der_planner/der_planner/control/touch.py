@@ -95,7 +95,7 @@ class TouchSense:
         self.threshold = exceeded(_CORRELATED / _HOUR, model.inputs + 2)
         self.newest = untouched(-np.inf, np.zeros(model.inputs))
         self._rate, self._slid = np.zeros((2, model.inputs))
-        self._stuck, self._variance = np.zeros((2, model.inputs)), np.zeros(model.inputs + 2)
+        self._stuck, self._swung = np.zeros((2, model.inputs)), np.zeros(model.inputs + 2)
         self._recent: deque[tuple[Lacking, float, Array, Array]] = deque()
         self._lately: deque[Lacking] = deque()
         self._weighed: list[tuple[float, float, bool]] = []
@@ -127,10 +127,9 @@ class TouchSense:
         )
         swings = (rate - self._rate) / _SWINGS
         moved_by = nominal.mass[nominal.periods(round(time / CONTROL_PERIOD))] @ swings
-        told = np.diag(lacking.covariance)
-        variance = told + np.append(_INERTIA_WRONG * moved_by, np.zeros(2)) ** 2
-        self._variance = np.maximum(variance, kept**2 * self._variance)
-        spread = lacking.covariance + np.diag(self._variance - told)
+        swung = np.append(_INERTIA_WRONG * moved_by, np.zeros(2)) ** 2
+        self._swung = np.maximum(swung, kept**2 * self._swung)
+        spread = lacking.covariance + np.diag(self._swung)
         return self.look(replace(lacking, stuck=self._stuck, covariance=spread))
 
     def look(self, lacking: Lacking) -> Touch:
