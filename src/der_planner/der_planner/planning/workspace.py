@@ -15,7 +15,6 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import make_interp_spline
-from scipy.optimize import least_squares
 
 from der_planner.arrays import Array, interpolate
 from der_planner.model import NODES, ArcModel, Model, RodModel
@@ -247,26 +246,14 @@ class Workspace:
     ) -> float:
         """Return the distance [m] from a point to the nearest tip within the pressure limit.
 
-        Bounded least squares from several starts, so that the nearest of the folds' sides counts.
+        The search has several starts, so that the nearest of the folds' sides counts.
         """
-        shape = kinematics or self.arcs
-        target, low, high = np.asarray(point, dtype=float), self.low, self.high
-
-        def miss(theta: Array) -> Array:
-            difference: Array = shape.tip(theta) - target
-            return difference
-
-        starts = [np.asarray(guess, dtype=float), *self._grid(np.array([0.25, 0.75]), 4)]
-        found = [
-            least_squares(
-                miss,
-                np.clip(start, low + 1e-9, high - 1e-9),
-                jac=shape.tip_jacobians,
-                bounds=(low, high),
-            )
-            for start in starts
-        ]
-        return min(float(np.linalg.norm(each.fun)) for each in found)
+        starts = np.vstack([guess, self._grid(np.array([0.25, 0.75]), 4)])
+        target = np.tile(np.asarray(point, dtype=float), (len(starts), 1))
+        limits = (self.low, self.high)
+        return float(
+            inverse_kinematics(kinematics or self.arcs, target, starts, bounds=limits)[1].min()
+        )
 
     def _grid(self, shares: Array, most: int) -> Array:
         """Return bend angles (P, M) [rad] at shares of the limits, of limbs with few segments all.
