@@ -24,6 +24,7 @@ from scipy.interpolate import PchipInterpolator
 from scipy.sparse.linalg import splu
 
 from der_planner.arrays import Array, interpolate
+from der_planner.planning.loads import place_of
 from der_planner.planning.paths import TipPath
 from der_planner.planning.timing import PathLimits, retimed
 from der_planner.planning.workspace import Workspace
@@ -75,7 +76,7 @@ class Deviation:
         largest: distance [m].
         mean: distance over the drawn path's time, or over its length if it has no times [m].
         time: when the nearest path is farthest, after its first point [s].
-        point: (x, y) of the drawn path there [m].
+        point: (2,) of the drawn path there [m].
         share: of the drawn path from which it is `NOTABLE` away or more, 0 … 1.
         slowed: duration over the drawn path's; 1 if it kept its times, NaN if it had none.
     """
@@ -83,7 +84,7 @@ class Deviation:
     largest: float
     mean: float
     time: float
-    point: tuple[float, float]
+    point: Array
     share: float
     slowed: float
 
@@ -94,8 +95,7 @@ class Deviation:
             parts.append(
                 f"the nearest path leaves {self.share * 100:.0f} % of the drawn one: it is "
                 f"{self.mean * 1000:.1f} mm away on average and {self.largest * 1000:.1f} mm at "
-                f"most, near ({self.point[0]:.4f}, "
-                f"{self.point[1]:.4f}) m, {self.time:.1f} s after its first point"
+                f"most, near {place_of(self.point)}, {self.time:.1f} s after its first point"
             )
         if self.slowed > 1.001:
             parts.append(
@@ -314,12 +314,11 @@ def _deviation(drawn: Array, tip: Array, when: Array, slowed: float) -> Deviatio
     """Compare tips (K, 2) with the drawn path, both evenly spaced along it."""
     distance = np.linalg.norm(drawn - tip, axis=-1)
     farthest = int(distance.argmax())
-    place = drawn[farthest]
     return Deviation(
         largest=float(distance[farthest]),
         mean=float(distance.mean()),
         time=float(when[farthest]),
-        point=(float(place[0]), float(place[1])),
+        point=drawn[farthest],
         share=float((distance >= NOTABLE).mean()),
         slowed=slowed,
     )

@@ -30,7 +30,7 @@ from der_planner.arrays import Array
 from der_planner.files import read_yaml
 from der_planner.model import RodModel
 from der_planner.model.compliance import compliance
-from der_planner.planning.loads import PlanningError
+from der_planner.planning.loads import PlanningError, place_of
 
 _CIRCLE = {"circle_m", "radius_m", "allowed_force_n"}
 _HALF_PLANE = {"half_plane_m", "normal", "allowed_force_n"}
@@ -319,15 +319,15 @@ def _obstacle(item: Any) -> Obstacle:
     keys = set(item) if isinstance(item, Mapping) else set()
     allowed = _number(item.get("allowed_force_n", 0.0), "allowed_force_n") if keys else 0.0
     if {"circle_m", "radius_m"} <= keys <= _CIRCLE:
-        radius, (x, y) = _number(item["radius_m"], "radius_m"), _pair(item["circle_m"], "circle_m")
-        return Obstacle(np.array([x, y]), radius, allowed, f"the circle at ({x:.4f}, {y:.4f}) m")
+        radius, centre = _number(item["radius_m"], "radius_m"), _pair(item["circle_m"], "circle_m")
+        return Obstacle(centre, radius, allowed, f"the circle at {place_of(centre)}")
     if {"half_plane_m", "normal"} <= keys <= _HALF_PLANE:
         edge, normal = _pair(item["half_plane_m"], "half_plane_m"), _pair(item["normal"], "normal")
         size = float(np.linalg.norm(normal))
         if size == 0.0:
             raise ValueError("the normal of a half-plane has a direction")
-        name = f"the edge at ({edge[0]:.4f}, {edge[1]:.4f}) m"
-        return Obstacle(edge - _LARGE / size * normal, _LARGE, allowed, name)
+        centre = edge - _LARGE / size * normal
+        return Obstacle(centre, _LARGE, allowed, f"the edge at {place_of(edge)}")
     raise ValueError(
         f"an obstacle has {', '.join(sorted(_CIRCLE))}, or {', '.join(sorted(_HALF_PLANE))}; got "
         f"{item}"

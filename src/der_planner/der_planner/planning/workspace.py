@@ -20,7 +20,7 @@ from der_planner.arrays import Array, interpolate
 from der_planner.model import NODES, ArcModel, Model, RodModel
 from der_planner.model.bending import Kinematics, inverse_kinematics
 from der_planner.model.rod import PoseFinder
-from der_planner.planning.loads import PlanningError, held_poses, stable_rest
+from der_planner.planning.loads import PlanningError, held_poses, place_of, stable_rest
 
 TOLERANCE = 1e-3
 """Points missed by less than this [m] count as reached (the models' reach differs by less)."""
@@ -43,7 +43,7 @@ class UnreachableError(PlanningError):
 
     Attributes:
         time: of the point in the motion [s].
-        point: (x, y) in `limb_base` [m].
+        point: (2,) in `limb_base` [m].
         distance: to the nearest reachable point [m].
         required_pressure: largest |differential pressure| the point would need [Pa]; NaN where no
             pressure reaches it.
@@ -51,7 +51,7 @@ class UnreachableError(PlanningError):
     """
 
     time: float
-    point: tuple[float, float]
+    point: Array
     distance: float
     required_pressure: float
     carried: float = 0.0
@@ -63,7 +63,7 @@ class UnreachableError(PlanningError):
             needed = f"it would need {self.required_pressure / 1000:.1f} kPa"
         carries = f"It carries {self.carried * 1000:.1f} g: carry less, move"
         return (
-            f"the point ({self.point[0]:.4f}, {self.point[1]:.4f}) m at t = {self.time:.2f} s is "
+            f"the point {place_of(self.point)} at t = {self.time:.2f} s is "
             f"out of reach: {self.distance * 1000:.1f} mm from what the limb reaches within its "
             f"pressure limit; {needed}. {carries if self.carried else 'Move'} or shrink the path "
             "(a named motion: by its amplitude, in rad), or follow the nearest path that the limb "
@@ -236,7 +236,7 @@ class Workspace:
         reached = misses[k] <= tolerance
         raise UnreachableError(
             float(time[k]),
-            (float(tip[k, 0]), float(tip[k, 1])),
+            tip[k],
             self.distance_to_reach(tip[k], angles[k], kinematics),
             float(pressures[k]) if reached else float("nan"),
         )
@@ -330,7 +330,7 @@ class Workspace:
             if branch in ("", item.branch):
                 return item.bend_angles
         raise PlanningError(
-            f"the first point ({tip[0, 0]:.4f}, {tip[0, 1]:.4f}) m has no solution on the branch "
+            f"the first point {place_of(tip[0])} has no solution on the branch "
             f"'{branch}' within the pressure limit, only on '{found[0].branch}'"
         )
 
