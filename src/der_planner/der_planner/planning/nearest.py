@@ -224,20 +224,20 @@ class _Search:
         states = np.stack([part.ravel() for part in np.meshgrid(*axes, indexing="ij")], axis=-1)
         tips, own = self._kinematics.tip(states), self._price(states)
         travel = [_TRAVEL / step * (axis[:, None] - axis) ** 2 for axis in axes]
-        shape = (size,) * count
-        total = (step * (((tips - target[0]) ** 2).sum(-1) + own)).reshape(shape)
-        origins = np.empty((len(target), len(states)), dtype=np.int32)
-        for k in range(1, len(target)):
-            origin = np.arange(len(states)).reshape(shape)
+        costs = [step * (((tips - point) ** 2).sum(-1) + own) for point in target]
+        # The least cost to come to each state, point by point; going along one axis at a time.
+        totals = [costs[0]]
+        for cost in costs[1:]:
+            total = totals[-1].reshape((size,) * count)
             for axis in range(count):
-                total, origin = _cheapest(total, origin, travel[axis], axis)
-            origins[k] = origin.ravel()
-            total = total + (step * (((tips - target[k]) ** 2).sum(-1) + own)).reshape(shape)
-        course = np.empty(len(target), dtype=int)
-        course[-1] = int(np.argmin(total))
-        for k in range(len(target) - 1, 0, -1):
-            course[k - 1] = origins[k, course[k]]
-        return states[course]
+                arriving = np.moveaxis(total, axis, -1)[..., None, :] + travel[axis]
+                total = np.moveaxis(arriving.min(axis=-1), -1, axis)
+            totals.append(total.ravel() + cost)
+        course = [int(np.argmin(totals[-1]))]
+        for total in totals[-2::-1]:
+            way = _TRAVEL / step * ((states - states[course[-1]]) ** 2).sum(-1)
+            course.append(int(np.argmin(total + way)))
+        return states[course[::-1]]
 
     def _price(self, states: Array) -> Array:
         """Return what a state (G, M) costs wherever the tip should be [m²]."""
@@ -296,18 +296,6 @@ class _Search:
         blocks = np.concatenate([self._kinematics.tip_jacobians(angles), by_angle], axis=1)
         near = sparse.bsr_array((blocks, np.arange(count), np.arange(count + 1)))
         return sparse.csr_array(sparse.vstack([near, self._smoothing]))
-
-
-def _cheapest(total: Array, origin: Array, travel: Array, axis: int) -> tuple[Array, Array]:
-    """Return the least cost to come to each state along one axis of the grid, and from where."""
-    costs, sources = np.moveaxis(total, axis, -1), np.moveaxis(origin, axis, -1)
-    arriving = costs[..., None, :] + travel
-    best = arriving.argmin(axis=-1)
-    least = np.take_along_axis(arriving, best[..., None], axis=-1)[..., 0]
-    return (
-        np.moveaxis(least, -1, axis),
-        np.moveaxis(np.take_along_axis(sources, best, axis=-1), -1, axis),
-    )
 
 
 def _deviation(drawn: Array, tip: Array, when: Array, slowed: float) -> Deviation:
