@@ -174,8 +174,6 @@ def _sampled(path: TipPath, samples: int) -> tuple[Array, Array]:
     each = int(np.clip(math.ceil(len(path.time) / samples), 1, _MOST_AVERAGED))
     offsets = ((np.arange(each) + 0.5) / each - 0.5) * time[1]
     fine = np.clip(time[:, None] + offsets, 0.0, path.duration)
-    if path.exact or len(path.time) < 3:
-        return time, interpolate(fine.ravel(), path.time, path.tip).reshape(samples, each, 2)
     # Without overshoot, whatever the points' spacing.
     drawn: Array = PchipInterpolator(path.time, path.tip)(fine)
     return time, drawn
