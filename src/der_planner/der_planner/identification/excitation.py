@@ -14,7 +14,6 @@ import numpy as np
 from der_planner.arrays import Array
 from der_planner.identification.fit import fit
 from der_planner.identification.log import CalibrationLog, LogError
-from der_planner.identification.readers import read_table
 from der_planner.identification.report import FitReport
 from der_planner.limb import Limb
 from der_planner.model import CONTROL_PERIOD as PERIOD
@@ -75,8 +74,11 @@ def read_excitation(path: Path, segment_count: int) -> Excitation:
         LogError: the file cannot be read, has other columns, numbers that are not finite, or
             times that are not 0, 0.05, 0.10 … s.
     """
-    table = np.column_stack(list(read_table(path).values()))
-    if table.shape[1] != segment_count + 1:
+    try:
+        table = np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2)
+    except (OSError, ValueError) as error:
+        raise LogError(f"cannot read the excitation {path}: {error}") from error
+    if table.shape[0] < 2 or table.shape[1] != segment_count + 1:
         raise LogError(
             f"the excitation {path} has {table.shape[0]} rows of {table.shape[1]} columns, "
             f"expected time_s and {segment_count} pressures below one line of names"
