@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 from scipy.interpolate import PchipInterpolator
-from scipy.sparse.linalg import splu
+from scipy.linalg import solveh_banded
 
 from der_planner.arrays import Array, interpolate
 from der_planner.planning.loads import place_of
@@ -183,14 +183,24 @@ def _smoothed(points: Array, step: float, wave: float) -> Array:
     """Return points (K, 2), `step` apart, with waves of length `wave` at half of their height."""
     weight = (wave / (2 * np.pi * step)) ** 4
     differences = _second_differences(len(points))
-    matrix = sparse.eye_array(len(points)) + weight * (differences.T @ differences)
-    return splu(matrix.tocsc(), "NATURAL").solve(points)
+    band = weight * _banded(differences.T @ differences, 3)
+    band[0] += 1.0
+    return solveh_banded(band, points, lower=True)
 
 
 def _second_differences(count: int) -> sparse.csr_array:
     """Return the matrix (K − 2, K) of second differences."""
     offsets, shape = [0, 1, 2], (count - 2, count)
     return sparse.diags_array([1.0, -2.0, 1.0], offsets=offsets, shape=shape, format="csr")
+
+
+def _banded(matrix: sparse.csr_array, rows: int) -> Array:
+    """Return the lower band (rows, n) of a symmetric matrix, as `solveh_banded` takes it."""
+    diagonals, band = matrix.todia(), np.zeros((rows, matrix.shape[0]))
+    for offset, values in zip(diagonals.offsets, diagonals.data, strict=True):
+        if offset <= 0:
+            band[-offset, : len(values)] = values
+    return band
 
 
 class _Search:
@@ -252,11 +262,12 @@ class _Search:
             tied = ((angles <= self._low) & (slope > 0)) | ((angles >= self._high) & (slope < 0))
             # An angle that a limit holds changes nothing, and stays.
             slopes = slopes @ sparse.diags_array((~tied).ravel().astype(float))
-            normal = slopes.T @ slopes + sparse.diags_array(tied.ravel().astype(float))
-            largest = max(float(normal.diagonal().max()), 1e-12)
+            band = _banded(slopes.T @ slopes, 2 * self._count + 1)
+            band[0] += tied.ravel()
             while damping < 1e3:
-                matrix = normal + damping * largest * sparse.eye_array(angles.size)
-                step = splu(matrix.tocsc(), "NATURAL").solve(np.where(tied, 0.0, -slope).ravel())
+                matrix = band.copy()
+                matrix[0] += damping * max(float(band[0].max()), 1e-12)
+                step = solveh_banded(matrix, np.where(tied, 0.0, -slope).ravel(), lower=True)
                 moved = np.clip(angles + step.reshape(angles.shape), self._low, self._high)
                 new = self._misses(moved)
                 if new @ new <= missed @ missed:
