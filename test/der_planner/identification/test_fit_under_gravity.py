@@ -14,8 +14,8 @@ from der_planner.identification.bends import NODES, Predicted
 from der_planner.identification.excitation import sweep, waves
 from der_planner.identification.lengths import (
     GivesWayError,
-    UnevenTips,
     uneven_tip,
+    uneven_tips,
     unevenness,
     with_lengths,
 )
@@ -105,11 +105,11 @@ def test_tips_tell_how_much_of_a_bend_is_the_weights():
     finer -= coarse.tip - model.kinematics.tip(coarse.bend_angles)
     # Lengths that are wrong by some millimetres are no reason to find another stiffness.
     other = RodModel(with_lengths(limb, np.array([0.117, 0.125, 0.003, 0.004])), NODES)
-    tips = UnevenTips(limb, other, log, finer)
+    tips = uneven_tips(limb, other, log, finer)
     stiffness = FreeTerms.of(other.limb, {"log_stiffness"})
 
     def rows(change: float) -> tuple[np.ndarray, np.ndarray]:
-        residual, slopes = tips.rows(Predicted(stiffness, other, log, np.array([0.0, change])))
+        residual, slopes = tips(Predicted(stiffness, other, log, np.array([0.0, change])))
         return residual[:-4], slopes()[:-4]  # the last ones are what is known of the lengths
 
     own = np.linalg.norm(rows(0.0)[0])

@@ -15,7 +15,8 @@ from apriltag_tracker.bodies.body_map import BodyMap
 from apriltag_tracker.synthetic.poses import MocapFaults, SyntheticMocap
 from apriltag_tracker.synthetic.shapes import constant_curvature
 from der_planner.identification import CalibrationLog, ColumnMap, LogError, read_csv
-from der_planner.identification.foreign import ask_map, bends_of, read_bag_table, read_poses
+from der_planner.identification.foreign import bends_of, read_bag_table, read_poses
+from der_planner.identification.readers import ask_map
 
 BODIES = Path(__file__).resolve().parents[3] / "src/apriltag_tracker/config/bodies.yaml"
 STORE = get_typestore(Stores.ROS2_JAZZY)

@@ -162,7 +162,7 @@ def lab_log(path, rest_from, rest_to):
 @pytest.mark.parametrize("rest_until", [10.0, "auto"])
 def test_each_log_finds_its_own_rest_even_if_it_is_not_exactly_zero(tmp_path, rest_until):
     """One map serves a log that rests first and one that rests last, at 0.09 hPa."""
-    columns = ColumnMap("t", ("u",), ("a", "b"), ("u",), pressure_unit="hPa", rest_until=rest_until)
+    columns = ColumnMap(**{**COLUMNS, "angles": ("u",), "tags": (), "rest_until": rest_until})
     for name, begin, end in (("first", 0.0, 12.0), ("last", 45.0, 60.0)):
         log = read_csv(lab_log(tmp_path / f"{name}.csv", begin, end), columns)
         resting = (log.time > begin) & (log.time < end)

@@ -65,9 +65,9 @@ from der_planner.identification.excitation import (
     within_limits,
     write_excitation,
 )
-from der_planner.identification.foreign import ask_map, is_bag
+from der_planner.identification.foreign import is_bag, is_ours
 from der_planner.identification.log import prepare
-from der_planner.identification.readers import is_ours, read_table
+from der_planner.identification.readers import ask_map, read_table
 from der_planner.identification.report import plot_prediction
 from der_planner.identification.stiffness import FREE, REST
 from der_planner.identification.terms import GROUPS

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 
 from der_planner.arrays import Array
 from der_planner.identification.least_squares import (
@@ -173,11 +174,8 @@ def _after_no_step(command: Array, rate: float, rising: bool = False) -> NDArray
     """
     change = np.diff(command, axis=0, prepend=command[:1])
     jump = (change if rising else np.abs(change)) > rate * PERIOD
-    count = round(STEP_MEMORY / PERIOD)
-    recent = np.cumsum(jump, axis=0)
-    before = np.concatenate([np.zeros((count, command.shape[1])), recent])[: len(recent)]
-    smooth: NDArray[np.bool_] = (recent - before) < 0.5
-    return smooth
+    memory = np.ones(round(STEP_MEMORY / PERIOD))
+    return np.asarray(lfilter(memory, [1.0], jump.astype(float), axis=0) < 0.5)
 
 
 def _fill_rate(command: Array, measured: Array, step: float) -> float:

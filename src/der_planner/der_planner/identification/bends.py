@@ -204,7 +204,7 @@ class BendFit:
         logs: Sequence[Prepared],
         more_rows: Callable[[Predicted], Rows] | None = None,
     ) -> None:
-        self.free, self._logs, self._more_rows = free, logs, more_rows
+        self.free, self._logs, self.more_rows = free, logs, more_rows
         # A search comes back to its best values after steps that led to nothing better. What is
         # kept must not know this fit: the two would hold each other, and 200 MB, in memory.
         self._kept = lru_cache(maxsize=3)(partial(_predict, free, model, logs))
@@ -261,16 +261,16 @@ class BendFit:
         except RuntimeError:  # also where arcs that buckle do not come to rest
             return None
         logs, places = self._logs, range(len(self._logs))
-        more = None if self._more_rows is None else self._more_rows(found[0])
+        more = [] if self.more_rows is None else [self.more_rows(found[0])]
         errors = [
             self._apart_and_weighed(k, found[k].angles - logs[k].log.bend_angles) for k in places
         ]
 
         def slopes() -> Array:
             by = [self._apart_and_weighed(k, found[k].by[0]) for k in places]
-            return np.concatenate(by if more is None else [*by, more[1]()])
+            return np.concatenate([*by, *(derivatives() for _, derivatives in more)])
 
-        return np.concatenate(errors if more is None else [*errors, more[0]]), slopes
+        return np.concatenate([*errors, *(residual for residual, _ in more)]), slopes
 
     def _apart_and_weighed(self, place: int, table: Array) -> Array:
         """Return the usable rows of a log's table (K, M, …), slow and fast parts, by weight."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import datetime
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -11,14 +11,15 @@ import numpy as np
 
 from der_planner.arrays import Array
 from der_planner.identification.air import AirFit, fit_air
-from der_planner.identification.bends import MOST_FITS, NODES, BendFit
+from der_planner.identification.bends import MOST_FITS, NODES, BendFit, Predicted
+from der_planner.identification.least_squares import Rows
 from der_planner.identification.lengths import (
     GeometryFit,
     GivesWayError,
-    UnevenTips,
     fit_geometry,
     lengths_at_their_end,
     lengths_of,
+    uneven_tips,
     unevenness,
 )
 from der_planner.identification.log import (
@@ -144,9 +145,9 @@ def _fit(
     offset = 0.0 if air is None else air.offset
     prepared = replace(recorded, pressure=recorded.pressure - offset)
     fitted = _fit_bends_and_lengths(limb, prepared, groups, warnings)
-    warnings += filter(None, [lengths_at_their_end(limb, fitted.known)])
+    warnings += filter(None, [lengths_at_their_end(limb, fitted.free.limb)])
     if hung is not None:
-        change, deviation = hung.stiffness_change(fitted.known, fitted.limb)
+        change, deviation = hung.stiffness_change(fitted.free.limb, fitted.limb)
         moved, _ = told(fitted.problem, fitted.values)
         warnings += against_motion(moved, change, deviation)
         weighed = fitted.free.told("log_stiffness", change, deviation)
@@ -195,34 +196,40 @@ def _fit(
 
 
 class _Fitted(NamedTuple):
-    """A limb with its lengths, the problem solved on it, what it left, and the limb found.
+    """The problem of a limb with its lengths, and the values that solve it.
 
     What the log did not tell is in ``kept``, pairs of segment and term.
     """
 
-    known: Limb
     lengths: GeometryFit | None
-    tips: UnevenTips | None
     problem: BendFit
     values: Array
-    remaining: Array
-    limb: Limb
     kept: frozenset[tuple[int, int]] = frozenset()
 
     @property
     def free(self) -> FreeTerms:
-        """The terms that were free."""
+        """The terms that were free, of the limb as it was known before."""
         return self.problem.free
 
-    def of_places(self, free: FreeTerms) -> Array:
-        """Return the values (P,) of some of the terms."""
-        found = dict(zip(self.free.places, self.values, strict=True))
-        return np.array([found[place] for place in free.places])
+    @property
+    def limb(self) -> Limb:
+        """The limb that was found."""
+        return self.free.limb_with(self.values)
+
+    @property
+    def remaining(self) -> Array:
+        """What is left of the bend angles (K, M) [rad]."""
+        return self.problem.remaining(self.values)
 
     @property
     def residual(self) -> Array:
         """Root mean square (M,) of what is left of the bend angles [rad]."""
         return np.asarray(np.sqrt(np.nanmean(self.remaining**2, axis=0)))
+
+    def of_places(self, free: FreeTerms) -> Array:
+        """Return the values (P,) of some of the terms."""
+        found = dict(zip(self.free.places, self.values, strict=True))
+        return np.array([found[place] for place in free.places])
 
 
 def _fit_bends_and_lengths(
@@ -247,7 +254,8 @@ def _fit_bends_and_lengths(
                 raise
             warnings.append(_NO_CUBIC)
             groups, passes = set(groups) - {"cubic"}, MOST_PASSES
-            fitted = _fit_bends(fitted.known, prepared, groups, lengths, fitted, fitted.tips)
+            known, tips = fitted.free.limb, fitted.problem.more_rows
+            fitted = _fit_bends(known, prepared, groups, lengths, fitted, tips)
             continue
         if passes == 0:
             break
@@ -255,8 +263,8 @@ def _fit_bends_and_lengths(
         lengths = fit_geometry(prior, prepared.log, uneven)
         if lengths is None:
             break
-        tips = UnevenTips(prior, RodModel(lengths.limb, NODES), prepared, lacking)
-        change = np.abs(lengths_of(lengths.limb) - lengths_of(fitted.known))
+        tips = uneven_tips(prior, RodModel(lengths.limb, NODES), prepared, lacking)
+        change = np.abs(lengths_of(lengths.limb) - lengths_of(fitted.free.limb))
         fitted = _fit_bends(lengths.limb, prepared, groups, lengths, fitted, tips)
         if change[: prior.segment_count + 1].max() < SAME_LENGTH:
             passes = 0
@@ -269,7 +277,7 @@ def _fit_bends(
     groups: Collection[str],
     lengths: GeometryFit | None,
     before: _Fitted | None = None,
-    tips: UnevenTips | None = None,
+    tips: Callable[[Predicted], Rows] | None = None,
 ) -> _Fitted:
     """Fit the rod to the bend angles.
 
@@ -290,7 +298,7 @@ def _fit_bends(
     free = FreeTerms.of(known, names, without(values_of(known, starts=True), groups))
     if not known.weighs_in_plane:
         free = free.told("log_stiffness", *stiffness_in_motion(known, prepared))
-    problem = BendFit(free, RodModel(known, NODES), [prepared], tips.rows if tips else None)
+    problem = BendFit(free, RodModel(known, NODES), [prepared], tips)
     if before is None:
         start = free.at_places(_static_start(free, prepared))
     else:
@@ -298,10 +306,7 @@ def _fit_bends(
         problem.weigh(before.problem.errors)
     # In turn with the lengths the weights are found, too, so that one search a pass will do.
     most = 1 if known.weighs_in_plane else MOST_FITS
-    values = problem.solve(_followed(problem, free, start), most)
-    return _Fitted(
-        known, lengths, tips, problem, values, problem.remaining(values), free.limb_with(values)
-    )
+    return _Fitted(lengths, problem, problem.solve(_followed(problem, free, start), most))
 
 
 def _static_start(free: FreeTerms, prepared: Prepared) -> Array:
@@ -353,17 +358,13 @@ def _again(fitted: _Fitted, free: FreeTerms, prepared: Prepared) -> _Fitted:
 
     Returns what was given where the rod cannot follow the log from there.
     """
-    start, tips = fitted.of_places(free), fitted.tips
-    problem = BendFit(free, RodModel(fitted.known, NODES), [prepared], tips.rows if tips else None)
-    problem.weigh(fitted.problem.errors)
+    before, start = fitted.problem, fitted.of_places(free)
+    problem = BendFit(free, RodModel(free.limb, NODES), [prepared], before.more_rows)
+    problem.weigh(before.errors)
     if not problem.search.follows(start):
         return fitted
-    values = problem.solve(start)
-    remaining, limb = problem.remaining(values), free.limb_with(values)
     kept = fitted.kept.union(set(fitted.free.places) - set(free.places))
-    return fitted._replace(
-        problem=problem, values=values, remaining=remaining, limb=limb, kept=kept
-    )
+    return _Fitted(fitted.lengths, problem, problem.solve(start), kept)
 
 
 def _with_arcs(

@@ -1,18 +1,17 @@
-"""Logs of other programs: tables of motion capture, bags with other messages, and what to ask."""
+"""Logs of other programs: tables of motion capture, and bags with other messages."""
 
 from __future__ import annotations
 
 import codecs
 import csv
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import dropwhile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from scipy.spatial.transform import Rotation
 
 from der_planner.arrays import Array
@@ -49,6 +48,17 @@ def is_bag(path: Path) -> bool:
     """Tell whether a path is that of a bag; one of nothing is, if it has no ending."""
     nothing = not (path.suffix or path.exists())
     return nothing or path.is_dir() or path.suffix in (".mcap", ".db3")
+
+
+def is_ours(path: Path) -> bool:
+    """Tell whether a bag is of our driver; one that cannot be read says why when it is read."""
+    from der_planner.bags import reader, record  # noqa: PLC0415
+
+    try:
+        with reader.BagReader(path) as bag:
+            return any(topic.type_name == record.PRESSURE_TYPE for topic in bag.topics.values())
+    except reader.BagError:
+        return True
 
 
 def read_poses(path: Path) -> PoseLog:
@@ -222,53 +232,3 @@ def _values(topic: str, message: Any) -> dict[str, float]:
     if isinstance(data, np.ndarray) and data.dtype.kind in "fi" and data.size <= _LARGEST_ARRAY:
         return {f"{topic}[{k}]": float(value) for k, value in enumerate(data)}
     return {}
-
-
-QUESTIONS = {
-    "time": "column of the time",
-    "time_unit": "unit of the time: s, ms or us",
-    "commanded": "columns of the commands: one a segment, or two, left chamber first",
-    "chambers": "columns of the measured chamber pressures, left and right of each segment",
-    "pressure_unit": "unit of the pressures: Pa, hPa, mbar, kPa, bar or psi",
-    "poses": "file of motion capture (CSV of Motive, TSV of QTM); empty: none",
-    "bodies": "body map of it: which body sits where",
-    "poses_late": "what to take off the times of the poses to have those of the table [s]",
-    "angles": "columns of the bend angles, one a segment",
-    "angle_unit": "unit of the angles: rad or deg",
-    "tip": "columns of the tip's x and y in limb_base; empty: none",
-    "length_unit": "unit of the tip: m, cm or mm",
-}
-"""What to ask for each key of a map of columns."""
-_LISTS = ("commanded", "chambers", "angles", "tip")
-_NEEDED = ("time", "commanded", "chambers", "bodies", "angles")
-_OF_POSES = ("bodies", "poses_late")
-_OF_COLUMNS = ("angles", "angle_unit", "tip", "length_unit")
-
-
-def ask_map(names: Sequence[str], path: Path, ask: Callable[[str], str] = input) -> None:
-    """Ask a person what the columns of a log are, and write the answers down.
-
-    Args:
-        names: of the columns.
-        path: of the map to write.
-        ask: shows a question and returns the answer; columns are answered by number or name.
-
-    Raises:
-        OSError: the map cannot be written.
-    """
-    print("\n".join(f"  {k}: {name}" for k, name in enumerate(names)))
-    print("answer with numbers or names of columns, with commas between them")
-    content: dict[str, Any] = {}
-    for key, question in QUESTIONS.items():
-        if key in (_OF_COLUMNS if "poses" in content else _OF_POSES):
-            continue
-        words = list[str]()
-        while not words:
-            words = ask(f"{question}: ").replace(",", " ").split()
-            if key not in _NEEDED:
-                break
-        is_column = key in _LISTS or key == "time"
-        found = [names[int(each)] if is_column and each.isdigit() else each for each in words]
-        if found:
-            content[key] = found if key in _LISTS else found[0]
-    path.write_text(yaml.safe_dump(content, sort_keys=False))

@@ -8,7 +8,6 @@ and ρ the square itself or, with ``softness``, a loss that grows like a straigh
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -90,7 +89,6 @@ class LeastSquares:
         self.unknowns = unknowns
         self._cheap = cheap
         self._rows, self._softness = rows, softness
-        self._last: tuple[bytes, Rows | None] = (b"", None)
 
     def follows(self, values: Array) -> bool:
         """Return whether the model follows with values (P,)."""
@@ -141,22 +139,15 @@ class LeastSquares:
 
         Rows that the model cannot follow are NaN, which drives the search to a shorter step.
         """
-        unknowns, key = self.unknowns, same_values(values, self.unknowns)
-        last, rows = self._last
-        if rows is None or last != key:
-            found = self._rows(values)
-            residual = np.full(1, np.nan) if found is None else found[0]
-            known = unknowns.known
-            prior = ((values - unknowns.prior) / unknowns.spread)[known]
+        unknowns, known, found = self.unknowns, self.unknowns.known, self._rows(values)
+        residual = np.full(1, np.nan) if found is None else found[0]
+        prior = ((values - unknowns.prior) / unknowns.spread)[known]
 
-            @functools.cache
-            def slopes() -> Array:
-                data = np.zeros((1, len(values))) if found is None else found[1]() * unknowns.scale
-                return np.concatenate([data, np.diag(unknowns.scale / unknowns.spread)[known]])
+        def slopes() -> Array:
+            data = np.zeros((1, len(values))) if found is None else found[1]() * unknowns.scale
+            return np.concatenate([data, np.diag(unknowns.scale / unknowns.spread)[known]])
 
-            rows = np.concatenate([residual, prior]), slopes
-            self._last = key, rows
-        return rows
+        return np.concatenate([residual, prior]), slopes
 
     def _summed(self, values: Array) -> Rows:
         """Return P + 1 rows that stand for all, the loss included.

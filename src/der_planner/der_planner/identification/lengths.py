@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -153,8 +154,10 @@ def uneven_tip(limb: Limb, log: Prepared, nodes: int = NODES) -> Array:
     return np.asarray(response.tip - model.kinematics.tip(response.bend_angles))
 
 
-class UnevenTips:
-    """The residual of the tips that tells the weight's share in the bend, for the best lengths.
+def uneven_tips(
+    prior: Limb, model: RodModel, log: Prepared, lacking: Array
+) -> Callable[[Predicted], Rows]:
+    """Return the residual of tips, for the best lengths, that tells the weight's share in the bend.
 
     A pressure and a rest angle bend a segment evenly, weight bends it most where it begins. So the
     tip at given bend angles tells how much of them is the weight's, which bend angles alone hardly
@@ -166,42 +169,40 @@ class UnevenTips:
         model: of the limb with the lengths that were fitted last.
         log: with tips and bend angles.
         lacking: (K, 2) of the tip, as `unevenness` gives it [m].
+
+    Returns:
+        The weighted residual of a prediction, and what gives its derivatives.
     """
+    seen, even, limb = log.usable & _seen(log.log), model.kinematics, model.limb
+    angles, weight = log.log.bend_angles[seen], 1.0 / (UNEVEN_ERROR * math.sqrt(CORRELATION))
+    tip = _even_tip(limb, angles)
+    measured = (log.log.tip - lacking)[seen] - tip
+    known, now = _known(prior), lengths_of(limb)
+    # A length at its bound stays there.
+    free = np.flatnonzero((now - known.low > _NUDGE) & (known.high - now > _NUDGE))
+    longer = [with_lengths(limb, now + _NUDGE * np.eye(len(now))[place]) for place in free]
+    columns = [(_even_tip(each, angles) - tip).ravel() / _NUDGE for each in longer]
+    slopes = np.reshape(columns, (len(free), tip.size)).T
+    by_lengths = np.concatenate([weight * slopes, np.diag(1.0 / known.spread[free])])
+    of_prior = ((now - known.prior) / known.spread)[free]
+    spanned = np.linalg.qr(by_lengths)[0]
 
-    def __init__(self, prior: Limb, model: RodModel, log: Prepared, lacking: Array) -> None:
-        self._seen, self._even = log.usable & _seen(log.log), model.kinematics
-        angles = log.log.bend_angles[self._seen]
-        limb = model.limb
-        tip = _even_tip(limb, angles)
-        self._uneven = (log.log.tip - lacking)[self._seen] - tip
-        self._weight = 1.0 / (UNEVEN_ERROR * math.sqrt(CORRELATION))
-        known, now = _known(prior), lengths_of(limb)
-        # A length at its bound stays there.
-        free = np.flatnonzero((now - known.low > _NUDGE) & (known.high - now > _NUDGE))
-        longer = [with_lengths(limb, now + _NUDGE * np.eye(len(now))[place]) for place in free]
-        columns = [(_even_tip(each, angles) - tip).ravel() / _NUDGE for each in longer]
-        slopes = np.reshape(columns, (len(free), tip.size)).T
-        by_lengths = np.concatenate([self._weight * slopes, np.diag(1.0 / known.spread[free])])
-        self._known = ((now - known.prior) / known.spread)[free]
-        self._spanned = np.linalg.qr(by_lengths)[0]
+    def left(by_tip: Array, by_prior: Array) -> Array:
+        every = np.concatenate([weight * by_tip, by_prior])
+        return np.asarray(every - spanned @ (spanned.T @ every))
 
-    def rows(self, found: Predicted) -> Rows:
-        """Return the weighted residual of a prediction, and what gives its derivatives."""
-        rows = self._seen
-        uneven = (found.tip - self._even.tip(found.angles))[rows] - self._uneven
+    def rows(found: Predicted) -> Rows:
+        uneven = (found.tip - even.tip(found.angles))[seen] - measured
 
-        def slopes() -> Array:
+        def by_unknowns() -> Array:
             angles_by, tip_by = found.by
-            evenly = self._even.tip_jacobians(found.angles[rows]) @ angles_by[rows]
-            by = (tip_by[rows] - evenly).reshape(-1, tip_by.shape[2])
-            none = np.zeros((len(self._known), by.shape[1]))
-            return self._left(np.concatenate([self._weight * by, none]))
+            evenly = even.tip_jacobians(found.angles[seen]) @ angles_by[seen]
+            by = (tip_by[seen] - evenly).reshape(-1, tip_by.shape[2])
+            return left(by, np.zeros((len(of_prior), by.shape[1])))
 
-        return self._left(np.concatenate([self._weight * uneven.ravel(), self._known])), slopes
+        return left(uneven.ravel(), of_prior), by_unknowns
 
-    def _left(self, rows: Array) -> Array:
-        left: Array = rows - self._spanned @ (self._spanned.T @ rows)
-        return left
+    return rows
 
 
 def _seen(log: CalibrationLog) -> NDArray[np.bool_]:

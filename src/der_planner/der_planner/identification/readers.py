@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import MISSING, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
 from der_planner.arrays import Array
@@ -18,6 +19,7 @@ from der_planner.identification.foreign import (
     LONGEST_SILENCE,
     bends_of,
     is_bag,
+    is_ours,
     lines_of,
     read_bag_table,
     read_poses,
@@ -83,46 +85,83 @@ def read_bag(path: str | Path, namespace: str = "") -> CalibrationLog:
     return CalibrationLog(grid - start, tables[0], tables[1], tables[2], tables[3], Path(path).name)
 
 
-@dataclass(frozen=True)
+def _names(value: object) -> tuple[str, ...]:
+    if not isinstance(value, list):
+        raise TypeError
+    return tuple(map(str, value))
+
+
+def _stretches(value: list[Any]) -> tuple[tuple[float, float], ...]:
+    return tuple((float(first), float(last)) for first, last in value)
+
+
+def _rest_until(value: Any) -> float | str:
+    return "auto" if value == "auto" else float(value)
+
+
+_KINDS: dict[Callable[[Any], Any], str] = {
+    str: "one word or name",
+    float: "a number",
+    _names: "a list of columns' names, as [name, name]",
+    _stretches: "a list of pairs of times in s, as [[1.5, 3.0]]",
+    _rest_until: "a time in s, or auto",
+}
+"""What reads the value of a key, and what it must be."""
+
+
+def _key(reading: Callable[[Any], Any], question: str = "", default: Any = MISSING) -> Any:
+    """Return the field of a key: what reads its value, and what asks a person for it."""
+    return field(default=default, metadata={"reading": reading, "question": question})
+
+
+@dataclass(frozen=True, kw_only=True)
 class ColumnMap:
-    """Which column is what, and in which unit.
+    """Which column is what, and in which unit; the keys in the order in which they are asked for.
 
     Attributes:
         time: column of the time.
+        time_unit, pressure_unit, angle_unit, length_unit: of `UNITS`.
         commanded: (M,) columns of commanded differential pressures, or (2M,) of commanded chamber
             pressures.
         chambers: (2M,) columns of measured chamber pressures: 0, 1 of segment 0, then of segment 1;
             or (M,) of measured differential pressures.
+        poses: table of motion capture in place of the angles; from the folder of the map.
+        bodies: body map of the poses; from the folder of the map.
+        poses_late: by which the clock of the poses is ahead of the table's [s].
         angles: (M,) columns of the segments' angles; left out where there are poses.
         tip: (2,) columns of x, y in `limb_base`; empty if there are none.
         tags: columns that repeat their last value, all of them, when a tag is lost; empty: never.
-        time_unit, pressure_unit, angle_unit, length_unit: of `UNITS`.
         angle_factor: bend angle per listed angle: 2 for chord angles, −1 for the other sign.
         rest_until: rows at rest before this time [s] give the sensors' offsets and are the zero of
             the pressures; a log that does not rest then, and every log with the word ``auto``, has
             its longest rest looked for; 0 keeps the pressures as they are.
         ignore: (first, last) [s] stretches to leave out.
-        poses: table of motion capture in place of the angles; from the folder of the map.
-        bodies: body map of the poses; from the folder of the map.
-        poses_late: by which the clock of the poses is ahead of the table's [s].
     """
 
-    time: str
-    commanded: tuple[str, ...]
-    chambers: tuple[str, ...]
-    angles: tuple[str, ...] = ()
-    tip: tuple[str, ...] = ()
-    tags: tuple[str, ...] = ()
-    time_unit: str = "s"
-    pressure_unit: str = "Pa"
-    angle_unit: str = "rad"
-    length_unit: str = "m"
-    angle_factor: float = 1.0
-    rest_until: float | str = 0.0
-    ignore: tuple[tuple[float, float], ...] = ()
-    poses: str = ""
-    bodies: str = ""
-    poses_late: float = 0.0
+    time: str = _key(str, "column of the time")
+    time_unit: str = _key(str, "unit of the time: s, ms or us", "s")
+    commanded: tuple[str, ...] = _key(
+        _names, "columns of the commands: one a segment, or two, left chamber first"
+    )
+    chambers: tuple[str, ...] = _key(
+        _names, "columns of the measured chamber pressures, left and right of each segment"
+    )
+    pressure_unit: str = _key(str, "unit of the pressures: Pa, hPa, mbar, kPa, bar or psi", "Pa")
+    poses: str = _key(str, "file of motion capture (CSV of Motive, TSV of QTM); empty: none", "")
+    bodies: str = _key(str, "body map of it: which body sits where", "")
+    poses_late: float = _key(
+        float, "what to take off the times of the poses to have those of the table [s]", 0.0
+    )
+    angles: tuple[str, ...] = _key(_names, "columns of the bend angles, one a segment", ())
+    angle_unit: str = _key(str, "unit of the angles: rad or deg", "rad")
+    tip: tuple[str, ...] = _key(
+        _names, "columns of the tip's x and y in limb_base; empty: none", ()
+    )
+    length_unit: str = _key(str, "unit of the tip: m, cm or mm", "m")
+    tags: tuple[str, ...] = _key(_names, default=())
+    angle_factor: float = _key(float, default=1.0)
+    rest_until: float | str = _key(_rest_until, default=0.0)
+    ignore: tuple[tuple[float, float], ...] = _key(_stretches, default=())
 
     @classmethod
     def from_yaml(cls, path: str | Path) -> ColumnMap:
@@ -134,10 +173,9 @@ class ColumnMap:
         content = read_yaml(path, "the column map", LogError)
         if not isinstance(content, Mapping):
             raise LogError(f"the column map {path} must hold keys and values")
-        known, given = {item.name for item in fields(cls)}, set(content)
-        seen = {"bodies"} if "poses" in given else {"angles"}
-        missing = ({"time", "commanded", "chambers"} | seen) - given
-        wrong = sorted(given - known) + sorted(missing)
+        known, given = {item.name: item.metadata["reading"] for item in fields(cls)}, set(content)
+        missing = _needed("poses" in given) - given
+        wrong = sorted(given - set(known)) + sorted(missing)
         if wrong:
             said = "missing" if wrong[0] in missing else "unknown"
             keys = ", ".join(sorted(known))
@@ -147,10 +185,10 @@ class ColumnMap:
             )
         values: dict[str, Any] = {}
         for key, value in content.items():
-            reading, expected = _KINDS.get(key, (str, "one word or name"))
             try:
-                values[key] = reading(value)
+                values[key] = known[key](value)
             except (TypeError, ValueError) as error:
+                expected = _KINDS[known[key]]
                 raise LogError(f"column map {path}: {key} is {value!r}, give {expected}") from error
         for key in ("poses", "bodies"):
             if key in values:
@@ -169,30 +207,44 @@ class ColumnMap:
         return UNITS[key][name]
 
 
-def _names(value: object) -> tuple[str, ...]:
-    if not isinstance(value, list):
-        raise TypeError
-    return tuple(map(str, value))
+def _needed(with_poses: bool) -> set[str]:
+    """Return the keys that a map needs, with a table of poses or without."""
+    return {"time", "commanded", "chambers", "bodies" if with_poses else "angles"}
 
 
-def _stretches(value: list[Any]) -> tuple[tuple[float, float], ...]:
-    return tuple((float(first), float(last)) for first, last in value)
+_OF_POSES = ("bodies", "poses_late")
+_OF_COLUMNS = ("angles", "angle_unit", "tip", "length_unit")
 
 
-_KINDS: dict[str, tuple[Callable[[Any], Any], str]] = {
-    **dict.fromkeys(
-        ("commanded", "chambers", "angles", "tags", "tip"),
-        (_names, "a list of columns' names, as [name, name]"),
-    ),
-    "angle_factor": (float, "a number"),
-    "poses_late": (float, "a number of seconds"),
-    "rest_until": (
-        lambda value: value if value == "auto" else float(value),
-        "a time in s, or auto",
-    ),
-    "ignore": (_stretches, "a list of pairs of times in s, as [[1.5, 3.0]]"),
-}
-"""How the value of a key is read, and what it must be; a key that is not here is a word."""
+def ask_map(names: Sequence[str], path: Path, ask: Callable[[str], str] = input) -> None:
+    """Ask a person what the columns of a log are, and write the answers down.
+
+    Args:
+        names: of the columns.
+        path: of the map to write.
+        ask: shows a question and returns the answer; columns are answered by number or name.
+
+    Raises:
+        OSError: the map cannot be written.
+    """
+    print("\n".join(f"  {k}: {name}" for k, name in enumerate(names)))
+    print("answer with numbers or names of columns, with commas between them")
+    content: dict[str, Any] = {}
+    for item in fields(ColumnMap):
+        key, question, with_poses = item.name, item.metadata["question"], "poses" in content
+        if not question or key in (_OF_COLUMNS if with_poses else _OF_POSES):
+            continue
+        words = list[str]()
+        while not words:
+            words = ask(f"{question}: ").replace(",", " ").split()
+            if key not in _needed(with_poses):
+                break
+        is_list = item.metadata["reading"] is _names
+        is_column = is_list or key == "time"
+        found = [names[int(each)] if is_column and each.isdigit() else each for each in words]
+        if found:
+            content[key] = found if is_list else found[0]
+    path.write_text(yaml.safe_dump(content, sort_keys=False))
 
 
 def read_csv(path: str | Path, columns: ColumnMap) -> CalibrationLog:
@@ -272,17 +324,6 @@ def read_log(path: Path, columns: Path | None, namespace: str = "") -> Calibrati
     if columns is None:
         raise LogError(f"{path} needs --columns FILE")
     return read_csv(path, ColumnMap.from_yaml(columns))
-
-
-def is_ours(path: Path) -> bool:
-    """Tell whether a bag is of our driver; one that cannot be read says why when it is read."""
-    from der_planner.bags import reader, record  # noqa: PLC0415
-
-    try:
-        with reader.BagReader(path) as bag:
-            return any(topic.type_name == record.PRESSURE_TYPE for topic in bag.topics.values())
-    except reader.BagError:
-        return True
 
 
 def _rest(time: Array, command: Array, rest_until: float | str) -> NDArray[np.bool_]:

@@ -7,7 +7,6 @@ import math
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 from itertools import compress
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +15,6 @@ from der_planner.arrays import Array
 from der_planner.identification.least_squares import Unknowns
 from der_planner.limb import Limb, Segment, Term, declarations
 
-AnyTerms = TypeVar("AnyTerms", bound="FreeTerms")
 GROUPS = ("asymmetry", "stiffening", "cubic", "coupling", "friction", "creep", "dynamics")
 """Model terms that may be left out, in the order in which they are explained."""
 OPTIONAL = ("mass",)
@@ -53,10 +51,8 @@ class FreeTerms:
     places: tuple[tuple[int, int], ...]
     terms: tuple[Term, ...]
 
-    @classmethod
-    def of(
-        cls: type[AnyTerms], limb: Limb, names: Collection[str], values: Array | None = None
-    ) -> AnyTerms:
+    @staticmethod
+    def of(limb: Limb, names: Collection[str], values: Array | None = None) -> FreeTerms:
         """Return the terms of these names in all segments that have them.
 
         Args:
@@ -74,7 +70,7 @@ class FreeTerms:
         )
         of_limb = terms_of(limb)
         terms = tuple(of_limb[index] for _, index in places)
-        return cls(limb, values_of(limb) if values is None else values, places, terms)
+        return FreeTerms(limb, values_of(limb) if values is None else values, places, terms)
 
     @property
     def unknowns(self) -> Unknowns:

@@ -71,34 +71,30 @@ DAY_TERMS = ("gain", "rest_angle", "friction_pressure")
 """Terms that change from day to day."""
 
 
-class DayTerms(FreeTerms):
-    """Terms of a limb that change from day to day; its arcs change alike."""
+def _day_terms(limb: Limb, names: Collection[str] = DAY_TERMS) -> FreeTerms:
+    """Return the terms of these names in all segments, with the spread of days."""
+    values, angle = values_of(limb), COLUMN["friction_angle"]
+    # A limb file without friction does not say over which bend it turns round.
+    values[:, angle] = values_of(limb, starts=True)[:, angle]
+    free = FreeTerms.of(limb, names, values)
+    least = LEAST_FRICTION_SPREAD * limb.pneumatics.pressure_limit
+    known = zip(free.terms, free.at_places(values).tolist(), strict=True)
+    return replace(free, terms=tuple(_of_days(term, value, least) for term, value in known))
 
-    @classmethod
-    def known(cls, limb: Limb, names: Collection[str] = DAY_TERMS) -> DayTerms:
-        """Return the terms of these names in all segments, with the spread of days."""
-        values, angle = values_of(limb), COLUMN["friction_angle"]
-        # A limb file without friction does not say over which bend it turns round.
-        values[:, angle] = values_of(limb, starts=True)[:, angle]
-        free = cls.of(limb, names, values)
-        least = LEAST_FRICTION_SPREAD * limb.pneumatics.pressure_limit
-        known = zip(free.terms, free.at_places(values).tolist(), strict=True)
-        return replace(free, terms=tuple(_of_days(term, value, least) for term, value in known))
 
-    def limb_with(self, free: Array) -> Limb:
-        """Return the limb with values (P,) of the free terms put in place.
+def _with_arcs_alike(before: Limb, found: Limb) -> Limb:
+    """Return a limb that was found whose arcs have changed as the rod's segments have.
 
-        Gain and friction of an arc change by the factors of its segment, its rest angle by as much.
-        """
-        found = super().limb_with(free)
-        if not self.limb.pcc_segments:
-            return found
-        arcs = replace(self.limb, segments=self.limb.pcc_segments)
-        of_arcs, before = values_of(arcs), values_of(self.limb)
-        share = np.divide(of_arcs, before, out=np.ones_like(before), where=before != 0.0)
-        share[:, COLUMN["rest_angle"]] = 1.0
-        changed = of_arcs + share * (values_of(found) - before)
-        return replace(found, pcc_segments=to_limb(arcs, changed).segments)
+    Gain and friction of an arc change by the factors of its segment, its rest angle by as much.
+    """
+    if not before.pcc_segments:
+        return found
+    arcs = replace(before, segments=before.pcc_segments)
+    of_arcs, of_rod = values_of(arcs), values_of(before)
+    share = np.divide(of_arcs, of_rod, out=np.ones_like(of_rod), where=of_rod != 0.0)
+    share[:, COLUMN["rest_angle"]] = 1.0
+    changed = of_arcs + share * (values_of(found) - of_rod)
+    return replace(found, pcc_segments=to_limb(arcs, changed).segments)
 
 
 def _of_days(term: Term, value: float, least_friction: float) -> Term:
@@ -213,7 +209,7 @@ def update(limb: Limb, logs: CalibrationLog | Sequence[CalibrationLog]) -> tuple
             f"the runs last {duration:.1f} s altogether: an update needs {LEAST_DURATION:.0f} s, "
             "and half a minute in which all segments move to tell all of it"
         )
-    every = DayTerms.known(limb)
+    every = _day_terms(limb)
     whole, known = BendFit(every, RodModel(limb, NODES), runs), every.unknowns.prior
     try:
         remaining = whole.remaining(known)
@@ -254,11 +250,11 @@ def update(limb: Limb, logs: CalibrationLog | Sequence[CalibrationLog]) -> tuple
     }
     residual = [round(float(value), 3) for value in np.degrees(after)]
     provenance = {**limb.provenance, "residual_deg": residual, "update": note}
-    found = replace(every.limb_with(values), provenance=provenance)
+    found = replace(_with_arcs_alike(limb, every.limb_with(values)), provenance=provenance)
     return found, Update(changes, before, after, tuple(warnings))
 
 
-def _solve(every: DayTerms, runs: Sequence[Prepared]) -> tuple[Array, Array]:
+def _solve(every: FreeTerms, runs: Sequence[Prepared]) -> tuple[Array, Array]:
     """Return the values (P,) and their deviations (P,), both as known before where not told."""
     known, errors = every.unknowns, None
     values, deviation, told = known.prior, known.spread, np.ones(len(known.prior), dtype=bool)
@@ -343,11 +339,14 @@ def adapted(limb: Limb, tip_of: Callable[[Limb], Array | None], tip: Array) -> L
         None where the limb is near the run already, or nothing much is gained.
     """
     seen = np.isfinite(tip).all(axis=1)
-    numbers = DayTerms.known(limb, ("gain", "rest_angle"))
+    numbers = _day_terms(limb, ("gain", "rest_angle"))
     unknowns = numbers.unknowns
 
+    def limb_with(values: Array) -> Limb:
+        return _with_arcs_alike(limb, numbers.limb_with(values))
+
     def missed(values: Array) -> Array:
-        found = tip_of(numbers.limb_with(values))
+        found = tip_of(limb_with(values))
         return np.full((int(seen.sum()), 2), np.nan) if found is None else (found - tip)[seen]
 
     def rows(values: Array) -> Rows:
@@ -364,4 +363,4 @@ def adapted(limb: Limb, tip_of: Callable[[Limb], Array | None], tip: Array) -> L
     if not before >= FAR:
         return None
     found = LeastSquares(unknowns, rows).solve()
-    return numbers.limb_with(found) if far(found) < BETTER * before else None
+    return limb_with(found) if far(found) < BETTER * before else None

@@ -381,9 +381,8 @@ def _find_poses(model: RodModel, time: Array, tip: Array, guess: Array) -> Poses
     missed = poses.misses > _POSE_TOLERANCE * model.limb.length
     if missed.any() and model.inputs > 1:
         k = int(np.argmax(missed))
-        point = float(tip[k, 0]), float(tip[k, 1])
         carried = sum(item.mass for item in model.limb.masses)
-        raise UnreachableError(float(time[k]), point, float(poses.misses[k]), math.nan, carried)
+        raise UnreachableError(float(time[k]), tip[k], float(poses.misses[k]), math.nan, carried)
     return poses
 
 

@@ -25,6 +25,11 @@ _HALVINGS = 8
 """Steps of the bisection for the mass that could be carried."""
 
 
+def place_of(point: Array) -> str:
+    """Return a point (2,) [m] as messages say it."""
+    return f"({point[0]:.4f}, {point[1]:.4f}) m"
+
+
 class PlanningError(ValueError):
     """A motion, method or limit does not allow a plan; the message says what to change."""
 
@@ -34,12 +39,12 @@ class BucklingError(PlanningError):
 
     Args:
         said: for people.
-        point: (x, y) of the tip where it does so on its way [m]; None: it does so at rest.
+        point: (2,) of the tip where it does so on its way [m]; None: it does so at rest.
     """
 
     def __init__(self, said: str, point: Array | None = None) -> None:
         super().__init__(said)
-        self.point = None if point is None else (float(point[0]), float(point[1]))
+        self.point = point
 
 
 @dataclass(eq=False)
@@ -48,7 +53,7 @@ class OverloadError(PlanningError):
 
     Attributes:
         time: when most is needed [s].
-        point: (x, y) of the tip then, in `limb_base` [m].
+        point: (2,) of the tip then, in `limb_base` [m].
         segment: which needs most.
         required_pressure: |differential pressure| that it needs there at rest [Pa].
         pressure_limit: largest that is allowed [Pa].
@@ -58,7 +63,7 @@ class OverloadError(PlanningError):
     """
 
     time: float
-    point: tuple[float, float]
+    point: Array
     segment: int
     required_pressure: float
     pressure_limit: float
@@ -78,8 +83,8 @@ class OverloadError(PlanningError):
             remedy = f"Even without the {carried} that it carries it is too much. {remedy}"
         return (
             f"segment {self.segment} would need {self.required_pressure / 1000:.1f} kPa to hold "
-            f"the limb at t = {self.time:.2f} s, where the tip is to be at ({self.point[0]:.4f}, "
-            f"{self.point[1]:.4f}) m: {self.pressure_limit / 1000:.1f} kPa are allowed. {remedy}"
+            f"the limb at t = {self.time:.2f} s, where the tip is to be at {place_of(self.point)}: "
+            f"{self.pressure_limit / 1000:.1f} kPa are allowed. {remedy}"
         )
 
 
@@ -110,12 +115,12 @@ def held_poses(finder: PoseFinder, start: RodState, time: Array, tip: Array, gue
     try:
         return finder.along(start, tip, guess)
     except ConvergenceError as error:
-        x, y = tip[error.step]
+        point = tip[error.step]
         raise BucklingError(
-            f"no pose of the limb leads on to its tip at ({x:.4f}, {y:.4f}) m at "
+            f"no pose of the limb leads on to its tip at {place_of(point)} at "
             f"t = {time[error.step]:.2f} s: it would buckle or snap through under its load. Shrink "
             "or move the motion, or mount the limb otherwise",
-            tip[error.step],
+            point,
         ) from error
 
 
@@ -163,17 +168,23 @@ def critical_share(limb: Limb) -> float:
     """Return the share of its gravity under which a straight limb buckles, by bisection; ≤ 1."""
     straight = tuple(dataclasses.replace(s, rest_curvature=0.0) for s in limb.segments)
     along = dataclasses.replace(limb, segments=straight, pcc_segments=())
-    low, high = 0.0, 1.0
-    for _ in range(12):
-        share = 0.5 * (low + high)
+    vented = np.zeros(limb.segment_count)
+
+    def stays(share: float) -> bool:
         gravity = (share * limb.gravity[0], 0.0, 0.0)
         rod = Rod.from_limb(dataclasses.replace(along, gravity=gravity))
-        vented = np.zeros(limb.segment_count)
-        if rod.smallest_stiffness(rod.equilibrium(vented), vented) > 0:
-            low = share
-        else:
-            high = share
-    return high
+        return rod.smallest_stiffness(rod.equilibrium(vented), vented) > 0
+
+    return _edge(stays, 12)[1]
+
+
+def _edge(holds: Callable[[float], bool], halvings: int) -> tuple[float, float]:
+    """Return two shares, up to 1, of which the lower one holds and the upper one may not."""
+    low, high = 0.0, 1.0
+    for _ in range(halvings):
+        share = 0.5 * (low + high)
+        low, high = (share, high) if holds(share) else (low, share)
+    return low, high
 
 
 def check_load(
@@ -208,16 +219,10 @@ def check_load(
             return False
         return bool(np.abs(less).max() <= limit)
 
-    possible = None
-    if carried and holds(0.0):
-        low, high = 0.0, 1.0
-        for _ in range(_HALVINGS):
-            share = 0.5 * (low + high)
-            low, high = (share, high) if holds(share) else (low, share)
-        possible = low * carried
+    possible = _edge(holds, _HALVINGS)[0] * carried if carried and holds(0.0) else None
     k, segment = np.unravel_index(int(np.abs(pressure).argmax()), pressure.shape)
-    point, most = (float(tip[k, 0]), float(tip[k, 1])), float(np.abs(pressure[k, segment]))
-    raise OverloadError(float(time[k]), point, int(segment), most, limit, carried, possible)
+    most = float(np.abs(pressure[k, segment]))
+    raise OverloadError(float(time[k]), tip[k], int(segment), most, limit, carried, possible)
 
 
 def check_stays(stiffness: Array, time: Array, tip: Array, what: str) -> None:
@@ -237,7 +242,6 @@ def check_stays(stiffness: Array, time: Array, tip: Array, what: str) -> None:
         k = int(np.argmax(falls))
         raise BucklingError(
             f"the {what} would snap through under the load at t = {time[k]:.2f} s, tip at "
-            f"({tip[k, 0]:.4f}, {tip[k, 1]:.4f}) m. Shrink or move the motion, or mount the limb "
-            "otherwise",
+            f"{place_of(tip[k])}. Shrink or move the motion, or mount the limb otherwise",
             tip[k],
         )

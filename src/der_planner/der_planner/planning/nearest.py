@@ -24,6 +24,7 @@ from scipy.interpolate import PchipInterpolator
 from scipy.linalg import solveh_banded
 
 from der_planner.arrays import Array, interpolate
+from der_planner.planning.loads import place_of
 from der_planner.planning.paths import TipPath
 from der_planner.planning.timing import PathLimits, retimed
 from der_planner.planning.workspace import Workspace
@@ -75,7 +76,7 @@ class Deviation:
         largest: distance [m].
         mean: distance over the drawn path's time, or over its length if it has no times [m].
         time: when the nearest path is farthest, after its first point [s].
-        point: (x, y) of the drawn path there [m].
+        point: (2,) of the drawn path there [m].
         share: of the drawn path from which it is `NOTABLE` away or more, 0 … 1.
         slowed: duration over the drawn path's; 1 if it kept its times, NaN if it had none.
     """
@@ -83,7 +84,7 @@ class Deviation:
     largest: float
     mean: float
     time: float
-    point: tuple[float, float]
+    point: Array
     share: float
     slowed: float
 
@@ -94,8 +95,7 @@ class Deviation:
             parts.append(
                 f"the nearest path leaves {self.share * 100:.0f} % of the drawn one: it is "
                 f"{self.mean * 1000:.1f} mm away on average and {self.largest * 1000:.1f} mm at "
-                f"most, near ({self.point[0]:.4f}, "
-                f"{self.point[1]:.4f}) m, {self.time:.1f} s after its first point"
+                f"most, near {place_of(self.point)}, {self.time:.1f} s after its first point"
             )
         if self.slowed > 1.001:
             parts.append(
@@ -174,8 +174,6 @@ def _sampled(path: TipPath, samples: int) -> tuple[Array, Array]:
     each = int(np.clip(math.ceil(len(path.time) / samples), 1, _MOST_AVERAGED))
     offsets = ((np.arange(each) + 0.5) / each - 0.5) * time[1]
     fine = np.clip(time[:, None] + offsets, 0.0, path.duration)
-    if path.exact or len(path.time) < 3:
-        return time, interpolate(fine.ravel(), path.time, path.tip).reshape(samples, each, 2)
     # Without overshoot, whatever the points' spacing.
     drawn: Array = PchipInterpolator(path.time, path.tip)(fine)
     return time, drawn
@@ -234,20 +232,20 @@ class _Search:
         states = np.stack([part.ravel() for part in np.meshgrid(*axes, indexing="ij")], axis=-1)
         tips, own = self._kinematics.tip(states), self._price(states)
         travel = [_TRAVEL / step * (axis[:, None] - axis) ** 2 for axis in axes]
-        shape = (size,) * count
-        total = (step * (((tips - target[0]) ** 2).sum(-1) + own)).reshape(shape)
-        origins = np.empty((len(target), len(states)), dtype=np.int32)
-        for k in range(1, len(target)):
-            origin = np.arange(len(states)).reshape(shape)
+        costs = [step * (((tips - point) ** 2).sum(-1) + own) for point in target]
+        # The least cost to come to each state, point by point; going along one axis at a time.
+        totals = [costs[0]]
+        for cost in costs[1:]:
+            total = totals[-1].reshape((size,) * count)
             for axis in range(count):
-                total, origin = _cheapest(total, origin, travel[axis], axis)
-            origins[k] = origin.ravel()
-            total = total + (step * (((tips - target[k]) ** 2).sum(-1) + own)).reshape(shape)
-        course = np.empty(len(target), dtype=int)
-        course[-1] = int(np.argmin(total))
-        for k in range(len(target) - 1, 0, -1):
-            course[k - 1] = origins[k, course[k]]
-        return states[course]
+                arriving = np.moveaxis(total, axis, -1)[..., None, :] + travel[axis]
+                total = np.moveaxis(arriving.min(axis=-1), -1, axis)
+            totals.append(total.ravel() + cost)
+        course = [int(np.argmin(totals[-1]))]
+        for total in totals[-2::-1]:
+            way = _TRAVEL / step * ((states - states[course[-1]]) ** 2).sum(-1)
+            course.append(int(np.argmin(total + way)))
+        return states[course[::-1]]
 
     def _price(self, states: Array) -> Array:
         """Return what a state (G, M) costs wherever the tip should be [m²]."""
@@ -309,28 +307,15 @@ class _Search:
         return sparse.csr_array(sparse.vstack([near, self._smoothing]))
 
 
-def _cheapest(total: Array, origin: Array, travel: Array, axis: int) -> tuple[Array, Array]:
-    """Return the least cost to come to each state along one axis of the grid, and from where."""
-    costs, sources = np.moveaxis(total, axis, -1), np.moveaxis(origin, axis, -1)
-    arriving = costs[..., None, :] + travel
-    best = arriving.argmin(axis=-1)
-    least = np.take_along_axis(arriving, best[..., None], axis=-1)[..., 0]
-    return (
-        np.moveaxis(least, -1, axis),
-        np.moveaxis(np.take_along_axis(sources, best, axis=-1), -1, axis),
-    )
-
-
 def _deviation(drawn: Array, tip: Array, when: Array, slowed: float) -> Deviation:
     """Compare tips (K, 2) with the drawn path, both evenly spaced along it."""
     distance = np.linalg.norm(drawn - tip, axis=-1)
     farthest = int(distance.argmax())
-    place = drawn[farthest]
     return Deviation(
         largest=float(distance[farthest]),
         mean=float(distance.mean()),
         time=float(when[farthest]),
-        point=(float(place[0]), float(place[1])),
+        point=drawn[farthest],
         share=float((distance >= NOTABLE).mean()),
         slowed=slowed,
     )

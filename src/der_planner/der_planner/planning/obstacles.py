@@ -30,13 +30,13 @@ from der_planner.arrays import Array
 from der_planner.files import read_yaml
 from der_planner.model import RodModel
 from der_planner.model.compliance import compliance
-from der_planner.planning.loads import PlanningError
+from der_planner.planning.loads import PlanningError, place_of
 
 _CIRCLE = {"circle_m", "radius_m", "allowed_force_n"}
 _HALF_PLANE = {"half_plane_m", "normal", "allowed_force_n"}
 _FINE = 4
 """Points a piece of the centreline between two nodes."""
-_LARGE = 100.0
+_LARGE = 1e4
 """Radius of a circle whose edge is straight beside a limb [m]."""
 _MARGIN = 1.5e-3
 """Distance that poses which are led past keep beside what is allowed [m]."""
@@ -50,33 +50,29 @@ _FAR = 10.0
 
 @dataclass(frozen=True)
 class Obstacle:
-    """A circle, or a half-plane if it has no radius.
+    """A circle; a half-plane is one so large that its edge is straight beside a limb.
 
     Attributes:
-        point: (2,) the circle's centre, or a point of the half-plane's edge [m].
-        radius: of the circle [m]; None: a half-plane.
-        normal: (2,) unit vector out of the half-plane; zeros of a circle.
+        centre: (2,) [m].
+        radius: [m].
         allowed_force: with which the limb may touch it [N].
+        name: for people, with its place.
     """
 
-    point: Array
-    radius: float | None
-    normal: Array
+    centre: Array
+    radius: float
     allowed_force: float
+    name: str
 
     def away(self, points: Array) -> tuple[Array, Array]:
         """Return the distances (…,) of points (…, 2) [m] and the directions (…, 2) out of it."""
-        between = points - self.point
-        if self.radius is None:
-            return between @ self.normal, np.broadcast_to(self.normal, points.shape)
+        between = points - self.centre
         distance = np.linalg.norm(between, axis=-1)
-        out = between / np.maximum(distance, 1e-12)[..., None]
-        return distance - self.radius, out
+        return distance - self.radius, between / np.maximum(distance, 1e-12)[..., None]
 
     def __str__(self) -> str:
-        """Return its name for people."""
-        place = f"({self.point[0]:.4f}, {self.point[1]:.4f}) m"
-        return f"the edge at {place}" if self.radius is None else f"the circle at {place}"
+        """Return its name."""
+        return self.name
 
 
 @dataclass(eq=False)
@@ -170,14 +166,8 @@ class Obstacles:
 
     @property
     def circles(self) -> Array:
-        """(P, 3) centre and radius of each [m]; a half-plane is a circle that is large enough."""
-        rows = [
-            (*each.point, each.radius)
-            if each.radius is not None
-            else (*(each.point - _LARGE * each.normal), _LARGE)
-            for each in self.items
-        ]
-        return np.array(rows).reshape(-1, 3)
+        """(P, 3) centre and radius of each [m]."""
+        return np.array([(*each.centre, each.radius) for each in self.items]).reshape(-1, 3)
 
     def nearest(self, obstacle: Obstacle, curves: Array) -> Nearest:
         """Return where poses come nearest to an obstacle.
@@ -329,14 +319,15 @@ def _obstacle(item: Any) -> Obstacle:
     keys = set(item) if isinstance(item, Mapping) else set()
     allowed = _number(item.get("allowed_force_n", 0.0), "allowed_force_n") if keys else 0.0
     if {"circle_m", "radius_m"} <= keys <= _CIRCLE:
-        radius = _number(item["radius_m"], "radius_m")
-        return Obstacle(_pair(item["circle_m"], "circle_m"), radius, np.zeros(2), allowed)
+        radius, centre = _number(item["radius_m"], "radius_m"), _pair(item["circle_m"], "circle_m")
+        return Obstacle(centre, radius, allowed, f"the circle at {place_of(centre)}")
     if {"half_plane_m", "normal"} <= keys <= _HALF_PLANE:
-        normal = _pair(item["normal"], "normal")
+        edge, normal = _pair(item["half_plane_m"], "half_plane_m"), _pair(item["normal"], "normal")
         size = float(np.linalg.norm(normal))
         if size == 0.0:
             raise ValueError("the normal of a half-plane has a direction")
-        return Obstacle(_pair(item["half_plane_m"], "half_plane_m"), None, normal / size, allowed)
+        centre = edge - _LARGE / size * normal
+        return Obstacle(centre, _LARGE, allowed, f"the edge at {place_of(edge)}")
     raise ValueError(
         f"an obstacle has {', '.join(sorted(_CIRCLE))}, or {', '.join(sorted(_HALF_PLANE))}; got "
         f"{item}"

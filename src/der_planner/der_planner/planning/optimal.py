@@ -220,10 +220,8 @@ class Optimiser:
 
     def _deviation(self, command: Array, first: int) -> Array:
         """Return u − u⁰ (W + 2, M) from two setpoints before the window on."""
-        deviation = np.zeros((len(command) - first + 2, command.shape[1]))
-        begin = max(0, first - 2)
-        deviation[2 - (first - begin) :] = command[begin:] - self.warm[begin : len(command)]
-        return deviation
+        before = np.zeros((2, command.shape[1]))
+        return np.concatenate([before, command - self.warm[: len(command)]])[first:]
 
     def _linearise(self, window: Window, state: State, damping: float) -> tuple[Array, Array]:
         """Return the quadratic model of the cost around the commands of a window.

@@ -178,11 +178,10 @@ def draw_shape(
     radius = SHAPE_SIZE * length * amplitude / (np.pi / 4)
     heading = float(bend.sum()) / 2
     along = np.array([np.cos(heading), np.sin(heading)])
-    across = np.array([-along[1], along[0]])
+    axes = radius * np.array([along, [-along[1], along[0]]])
     if name in ("line", "star"):
-        corners = np.array(_corners(name))
-        points = centre + radius * (corners[:, :1] * along + corners[:, 1:] * across)
-        loop = np.concatenate([points] + [points[1:]] * (cycles - 1))
+        corners = centre + _corners(name) @ axes
+        loop = np.concatenate([corners] + [corners[1:]] * (cycles - 1))
         return polygon(loop, period * cycles)
     total = period * cycles
     time = np.linspace(0.0, total + period / 4, _SHAPE_POINTS * 4 * cycles + 1)
@@ -191,8 +190,7 @@ def draw_shape(
         local = np.column_stack([np.cos(phase), np.sin(phase)])
     else:
         local = np.column_stack([np.sin(2 * phase) / 2, np.sin(phase)])
-    points = centre + radius * (local[:, :1] * along + local[:, 1:] * across)
-    return TipPath(time, points)
+    return TipPath(time, centre + local @ axes)
 
 
 def _faded_phase(turns: Array, cycles: int) -> Array:
@@ -208,11 +206,11 @@ def _faded_phase(turns: Array, cycles: int) -> Array:
     return np.where(turns > total - fade, cycles - ramp(total - turns), begun)
 
 
-def _corners(name: str) -> list[tuple[float, float]]:
+def _corners(name: str) -> Array:
     if name == "line":
-        return [(0.0, -1.0), (0.0, 1.0), (0.0, -1.0)]
-    turns = np.arange(6) * 2 / 5
-    return [(float(np.cos(2 * np.pi * t)), float(np.sin(2 * np.pi * t))) for t in turns]
+        return np.array([(0.0, -1.0), (0.0, 1.0), (0.0, -1.0)])
+    phase = 2 * np.pi * np.arange(6) * 2 / 5
+    return np.column_stack([np.cos(phase), np.sin(phase)])
 
 
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "s": 1.0, "ms": 0.001}

@@ -8,8 +8,9 @@ nor the motion; model and kinematics are built anew from them.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,8 @@ SCHEMA_VERSION = 1
 SUFFIX = ".yaml"
 _SAME = 1e-9
 """Relative difference of two numbers of limbs that are the same."""
+_MOVES_NOTHING = ("name", "provenance", "calibrated", "pcc_segments")
+"""Keys of a limb's mapping that do not move it as its model sees it."""
 _SINGLE: dict[str, type] = dict.fromkeys(("motion", "model", "method"), str)
 _SINGLE |= {"amplitude": float, "period": float, "cycles": int, "solve_time": float}
 """What a file has of a plan beside its rows."""
@@ -249,25 +252,18 @@ def learned_plan(folder: str | Path | None, name: str, limb: Limb) -> Plan:
     return plan
 
 
-def difference(one: Mapping[str, Any], other: Mapping[str, Any]) -> str:
-    """Return the name of the first number of two limbs that differs; empty if they are one."""
-    ours, theirs = dict(_leaves(one)), dict(_leaves(other))
-    for name in {**ours, **theirs}:
-        a, b = ours.get(name), theirs.get(name)
-        near = isinstance(a, float) and isinstance(b, float) and math.isclose(a, b, rel_tol=_SAME)
-        if a != b and not near:
-            return name
-    return ""
+def difference(one: Any, other: Any, name: str = "") -> str:
+    """Return the name of the first number that differs in the mappings of two limbs, else empty.
 
-
-def _leaves(content: Any, name: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield what moves a limb of its mapping, each number by its whole name."""
-    if isinstance(content, Mapping):
-        for key, value in content.items():
-            if key not in ("name", "provenance", "calibrated", "pcc_segments"):
-                yield from _leaves(value, f"{name}.{key}".strip("."))
-    elif isinstance(content, list | tuple):
-        for place, entry in enumerate(content):
-            yield from _leaves(entry, f"{name}[{place}]")
+    What does not move a limb may differ.
+    """
+    if isinstance(one, Mapping) and isinstance(other, Mapping):
+        keys = (key for key in {**one, **other} if key not in _MOVES_NOTHING)
+        parts = [(f"{name}.{key}".strip("."), one.get(key), other.get(key)) for key in keys]
+    elif isinstance(one, list | tuple) and isinstance(other, list | tuple):
+        parts = [(f"{name}[{k}]", *pair) for k, pair in enumerate(zip_longest(one, other))]
+    elif isinstance(one, float) and isinstance(other, float):
+        return "" if math.isclose(one, other, rel_tol=_SAME) else name
     else:
-        yield name, content
+        return "" if one == other else name
+    return next(filter(None, (difference(a, b, part) for part, a, b in parts)), "")

@@ -15,13 +15,12 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import make_interp_spline
-from scipy.optimize import least_squares
 
 from der_planner.arrays import Array, interpolate
 from der_planner.model import NODES, ArcModel, Model, RodModel
 from der_planner.model.bending import Kinematics, inverse_kinematics
 from der_planner.model.rod import PoseFinder
-from der_planner.planning.loads import PlanningError, held_poses, stable_rest
+from der_planner.planning.loads import PlanningError, held_poses, place_of, stable_rest
 
 TOLERANCE = 1e-3
 """Points missed by less than this [m] count as reached (the models' reach differs by less)."""
@@ -44,7 +43,7 @@ class UnreachableError(PlanningError):
 
     Attributes:
         time: of the point in the motion [s].
-        point: (x, y) in `limb_base` [m].
+        point: (2,) in `limb_base` [m].
         distance: to the nearest reachable point [m].
         required_pressure: largest |differential pressure| the point would need [Pa]; NaN where no
             pressure reaches it.
@@ -52,7 +51,7 @@ class UnreachableError(PlanningError):
     """
 
     time: float
-    point: tuple[float, float]
+    point: Array
     distance: float
     required_pressure: float
     carried: float = 0.0
@@ -64,7 +63,7 @@ class UnreachableError(PlanningError):
             needed = f"it would need {self.required_pressure / 1000:.1f} kPa"
         carries = f"It carries {self.carried * 1000:.1f} g: carry less, move"
         return (
-            f"the point ({self.point[0]:.4f}, {self.point[1]:.4f}) m at t = {self.time:.2f} s is "
+            f"the point {place_of(self.point)} at t = {self.time:.2f} s is "
             f"out of reach: {self.distance * 1000:.1f} mm from what the limb reaches within its "
             f"pressure limit; {needed}. {carries if self.carried else 'Move'} or shrink the path "
             "(a named motion: by its amplitude, in rad), or follow the nearest path that the limb "
@@ -237,7 +236,7 @@ class Workspace:
         reached = misses[k] <= tolerance
         raise UnreachableError(
             float(time[k]),
-            (float(tip[k, 0]), float(tip[k, 1])),
+            tip[k],
             self.distance_to_reach(tip[k], angles[k], kinematics),
             float(pressures[k]) if reached else float("nan"),
         )
@@ -247,26 +246,14 @@ class Workspace:
     ) -> float:
         """Return the distance [m] from a point to the nearest tip within the pressure limit.
 
-        Bounded least squares from several starts, so that the nearest of the folds' sides counts.
+        The search has several starts, so that the nearest of the folds' sides counts.
         """
-        shape = kinematics or self.arcs
-        target, low, high = np.asarray(point, dtype=float), self.low, self.high
-
-        def miss(theta: Array) -> Array:
-            difference: Array = shape.tip(theta) - target
-            return difference
-
-        starts = [np.asarray(guess, dtype=float), *self._grid(np.array([0.25, 0.75]), 4)]
-        found = [
-            least_squares(
-                miss,
-                np.clip(start, low + 1e-9, high - 1e-9),
-                jac=shape.tip_jacobians,
-                bounds=(low, high),
-            )
-            for start in starts
-        ]
-        return min(float(np.linalg.norm(each.fun)) for each in found)
+        starts = np.vstack([guess, self._grid(np.array([0.25, 0.75]), 4)])
+        target = np.tile(np.asarray(point, dtype=float), (len(starts), 1))
+        limits = (self.low, self.high)
+        return float(
+            inverse_kinematics(kinematics or self.arcs, target, starts, bounds=limits)[1].min()
+        )
 
     def _grid(self, shares: Array, most: int) -> Array:
         """Return bend angles (P, M) [rad] at shares of the limits, of limbs with few segments all.
@@ -343,7 +330,7 @@ class Workspace:
             if branch in ("", item.branch):
                 return item.bend_angles
         raise PlanningError(
-            f"the first point ({tip[0, 0]:.4f}, {tip[0, 1]:.4f}) m has no solution on the branch "
+            f"the first point {place_of(tip[0])} has no solution on the branch "
             f"'{branch}' within the pressure limit, only on '{found[0].branch}'"
         )
 

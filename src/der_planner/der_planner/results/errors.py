@@ -138,14 +138,11 @@ def _best_lag(reference: Stream, time: Array, measured: Array, margin: float) ->
 
 
 def _fit_gains(reference: Array, measured: Array) -> tuple[Array, Array]:
-    gains, fitted = np.ones(2), np.empty_like(measured)
-    for axis in range(2):
-        centred = reference[:, axis] - reference[:, axis].mean()
-        power = float(centred @ centred)
-        if power > 1e-12 * len(centred):
-            gains[axis] = float(centred @ measured[:, axis]) / power
-        fitted[:, axis] = measured[:, axis].mean() + gains[axis] * centred
-    return gains, fitted
+    centred = reference - reference.mean(axis=0)
+    power, shared = (centred**2).sum(axis=0), (centred * measured).sum(axis=0)
+    # An axis along which the reference stands still has no gain.
+    gains = np.divide(shared, power, out=np.ones(2), where=power > 1e-12 * len(centred))
+    return gains, measured.mean(axis=0) + gains * centred
 
 
 def check_tracker(tip: Stream, truth: Stream | None, first: float, last: float) -> dict[str, float]:

@@ -17,7 +17,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from der_planner.arrays import Array
-from der_planner.bags.run import RunSeries
+from der_planner.bags.run import RunSeries, Stream
 from der_planner.results.errors import error_series
 from der_planner.results.evaluation import DRAWN, RunResult
 from der_planner.results.statistics import learning_curves
@@ -128,28 +128,26 @@ def plot_tip(runs: Sequence[RunSeries], folder: Path) -> list[Path]:
 
 def _draw_tip_row(row: Sequence[Axes], title: str, runs: Sequence[RunSeries]) -> None:
     plane, over_x, over_y = row
+
+    def draw(series: Stream, label: str, look: dict[str, Any]) -> None:
+        x, y = series.value.T * CM
+        plane.plot(x, y, label=label, **look)
+        over_x.plot(series.time, x, **look)
+        over_y.plot(series.time, y, **look)
+
     colours = colours_of(runs)
     for run in runs:
         label = label_of(run)
-        look: dict[str, Any] = {
+        look = {
             "color": colours[label],
             "alpha": 0.9 if len(runs) <= 4 * len(colours) else 0.5,
             "lw": 1.0,
             "ls": DASHES.get(run.description.model, "-."),
         }
-        shown = run.tip.between(0.0, run.reference.time[-1])
-        tip = shown.value * CM
-        plane.plot(tip[:, 0], tip[:, 1], label=label, **look)
-        over_x.plot(shown.time, tip[:, 0], **look)
-        over_y.plot(shown.time, tip[:, 1], **look)
+        draw(run.tip.between(0.0, run.reference.time[-1]), label, look)
     if drawn := runs[0].description.extra.get(DRAWN):
         plane.plot(*np.transpose(drawn) * CM, label="drawn", color="0.6", ls=":")
-    reference = runs[0].reference
-    black: dict[str, Any] = {"color": REFERENCE, "lw": 0.9, "ls": ":"}
-    value = reference.value * CM
-    plane.plot(value[:, 0], value[:, 1], label="reference", **black)
-    over_x.plot(reference.time, value[:, 0], **black)
-    over_y.plot(reference.time, value[:, 1], **black)
+    draw(runs[0].reference, "reference", {"color": REFERENCE, "lw": 0.9, "ls": ":"})
     plane.set_aspect("equal", adjustable="datalim")
     plane.set(xlabel="x [cm]", ylabel="y [cm]", title=title)
     over_x.set(xlabel="time [s]", ylabel="x [cm]")

@@ -7,7 +7,6 @@ import html
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 from string import Template
 from typing import Any
@@ -48,21 +47,20 @@ _CAPTIONS = {
 _PAGE = Template((Path(__file__).parent / "page.html").read_text(encoding="utf-8"))
 
 
-def results_document(results: Sequence[RunResult]) -> dict[str, Any]:
-    """Return the content of ``results.json``: runs, summary over trials, comparisons."""
-    return {
+def write_results(results: Sequence[RunResult], folder: Path) -> Path:
+    """Write ``results.json`` into a folder, whole or not at all, and return its path.
+
+    It holds the runs, a summary over trials, and comparisons.
+    """
+    content = {
         "format": FORMAT,
-        "runs": [json_value(asdict(result)) for result in results],
-        "summary": [json_value(asdict(row)) for row in summarise(results)],
-        "comparisons": [json_value(asdict(entry)) for entry in compare(results)],
+        "runs": [asdict(result) for result in results],
+        "summary": [asdict(row) for row in summarise(results)],
+        "comparisons": [asdict(entry) for entry in compare(results)],
         "side_by_side": side_by_side(results),
     }
-
-
-def write_results(results: Sequence[RunResult], folder: Path) -> Path:
-    """Write ``results.json`` into a folder, whole or not at all, and return its path."""
     path = Path(folder) / "results.json"
-    write_whole(path, json.dumps(results_document(results), indent=1, allow_nan=False) + "\n")
+    write_whole(path, json.dumps(json_value(content), indent=1, allow_nan=False) + "\n")
     return path
 
 
@@ -149,18 +147,18 @@ def _sections(results: Sequence[RunResult], figures: Sequence[str]) -> list[str]
 
 def side_by_side_table(results: Sequence[RunResult]) -> Table:
     """Return the table of `side_by_side` in cm; without rows where nothing stands beside."""
+
+    def show(key: str) -> Callable[[dict[str, Any]], str]:
+        return lambda row: number(row[key], CM, 3)
+
     columns: dict[str, Callable[[dict[str, Any]], str]] = {
         "case": lambda row: CASE.get(row["motion"], row["motion"]),
         "model": lambda row: row["model"].upper(),
     }
     for name in CONTROLS:
         head = name.replace("open_loop", "open loop").replace("_", " + ")
-        columns[f"{head}, E [cm]"] = partial(_error_of, f"{name}_m")
+        columns[f"{head}, E [cm]"] = show(f"{name}_m")
     return Table.of(side_by_side(results), columns, names=2)
-
-
-def _error_of(key: str, row: dict[str, Any]) -> str:
-    return number(row[key], CM, 3)
 
 
 Columns = dict[str, Callable[[RunResult], str]]
