@@ -106,8 +106,12 @@ def test_map_files_are_read_and_wrong_keys_and_values_are_named(tmp_path, line, 
             "cp1252"
         ),
         (ROWS + "0.5,40,10").encode(),
+        ("# rig 3\n# " + ROWS).encode(),
+        ROWS.replace(",", "   ").encode(),
+        "".join(f"{row},{'on' if n else 'mode'}\n" for n, row in enumerate(ROWS.split())).encode(),
     ],
-    ids=["crlf", "bom", "utf16", "comment", "semicolon", "tabs", "quotes", "cp1252", "cut-short"],
+    ids=["crlf", "bom", "utf16", "comment", "semicolon", "tabs", "quotes", "cp1252", "cut-short",
+         "savetxt", "blanks", "text"],
 )  # fmt: skip
 def test_tables_of_other_programs_are_read_alike(tmp_path, table, written):
     expected = read_csv(table, ColumnMap(**COLUMNS))
@@ -137,6 +141,7 @@ def test_rows_need_a_time_of_their_own(tmp_path, table):
         ("t,u\n0,1,2\n1,2,3\n", "have 3 columns, its header has 2"),
         ("t,u,u\n0,1,2\n1,2,3\n", "two columns 'u'"),
         ("t,u\n", "fewer than two rows"),
+        ("PK\0\0 of a spreadsheet", "is no text: write it as CSV"),
     ],
 )
 def test_damaged_tables_are_refused(tmp_path, written, said):
