@@ -228,6 +228,15 @@ def test_other_units_are_named(door):
         prepare(replace(log, **change(log)), LIMB, to_fit=False)
 
 
+def test_milliseconds_of_a_fast_log_are_no_seconds():
+    still = np.zeros((20_000, 2))
+    log = CalibrationLog(np.arange(20e3), still, still, still, still)
+    with pytest.raises(
+        LogError, match=r"lasts 2e\+04 s, with a row every 1 s: give the time in sec"
+    ):
+        prepare(log, LIMB, to_fit=False)
+
+
 @pytest.mark.parametrize("wrong", [lambda tip: tip[:, ::-1], lambda tip: tip * [1.0, -1.0]])
 def test_tips_in_other_axes_than_the_limbs_are_refused(wrong):
     log = slow_log()

@@ -26,8 +26,8 @@ SWING = np.deg2rad(0.5)
 """Amplitude below which a swing need not be waited for [rad]."""
 LONGEST_PERIOD = 5.0
 """Median time between two rows above which the time must have another unit [s]."""
-LEAST_DURATION = 1.0
-"""Duration below which it must, too [s]."""
+LEAST_DURATION, LONGEST_DURATION = 1.0, 1e4
+"""Durations below and above which it must, too [s]."""
 LEAST_MOTION = np.deg2rad(3.0)
 """Range of motion from which on gains are judged [rad]."""
 TOO_LARGE = 3.0
@@ -268,7 +268,7 @@ def _still_swinging(time: Array, pressure: Array, bend: Array, limb: Limb) -> ND
 def _check_time(log: CalibrationLog) -> None:
     """Refuse a log whose time is not in seconds."""
     period, duration = float(np.median(np.diff(log.time))), float(np.ptp(log.time))
-    if period > LONGEST_PERIOD or duration < LEAST_DURATION:
+    if period > LONGEST_PERIOD or not LEAST_DURATION <= duration <= LONGEST_DURATION:
         raise LogError(
             f"the log lasts {duration:.3g} s, with a row every {period:.3g} s: give the time in "
             "seconds, or name its unit in columns.yaml (time_unit)"
