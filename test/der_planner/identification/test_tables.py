@@ -245,6 +245,13 @@ def test_tips_in_other_axes_than_the_limbs_are_refused(wrong):
         prepare(replace(log, tip=wrong(log.tip)), LIMB)
 
 
+@pytest.mark.parametrize(("late", "said"), [(1.0, "1.00 s before"), (-1.0, "1.00 s after")])
+def test_pressures_and_bends_of_two_clocks_are_said(late, said):
+    log = slow_log()
+    assert said in prepare(log.seen_earlier(-late), LIMB).warnings[-1]
+    assert prepare(log.seen_earlier(-0.2 * late), LIMB).warnings == ()
+
+
 def test_single_impossible_numbers_are_left_out_and_said():
     log = slow_log()
     log.bend_angles[100, 0], log.measured_differential[200, 1] = 1e9, -1e9

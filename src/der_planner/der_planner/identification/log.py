@@ -34,6 +34,10 @@ TOO_LARGE = 3.0
 """Largest differential pressure, over the prior's limit, that is not taken for another unit."""
 ANOTHER_SIDE = math.radians(25.0)
 """Direction of the tips beside that of the bend angles above which their axes differ [rad]."""
+OTHER_CLOCKS = 3.0, 0.6, 0.25
+"""Clocks that are looked for differ by up to so much [s], and by this or more if it leaves so
+little of the squares that evenly bent segments miss: friction and slow air leave three times as
+much."""
 LONGEST_SWING = 12.0
 """Longest time at the beginning of a log that is waited for a swing to end [s]."""
 
@@ -237,6 +241,7 @@ def prepare(
         _check_commands(grid, least_excitation)
         _check_excitation(pressure[valid & ~swinging], least_excitation)
         _check_match(pressure, bend, warnings)
+        _check_clocks(pressure, bend, warnings)
         _check_axes(grid, limb)
     if swinging.any():
         grid.bend_angles[swinging], grid.tip[swinging] = np.nan, np.nan
@@ -386,3 +391,22 @@ def _check_match(pressure: Array, bend: Array, warnings: list[str]) -> None:
                 f"segment {index} bends the wrong way: positive differential pressure must bend "
                 "toward +y; swap the two chambers or the sign in the column map"
             )
+
+
+def _check_clocks(pressure: Array, bend: Array, warnings: list[str]) -> None:
+    """Warn of bends that go with the pressures of another time."""
+    farthest, least, share = OTHER_CLOCKS
+    reach = round(farthest / CONTROL_PERIOD)
+    inner, left = bend[reach:-reach], {}
+    for shift in range(-reach, reach + 1, 5):
+        moved = np.column_stack([np.roll(pressure, shift, axis=0), np.ones(len(pressure))])
+        design = moved[reach:-reach]
+        left[shift] = np.sum((inner - design @ np.linalg.lstsq(design, inner, rcond=None)[0]) ** 2)
+    best = min(left, key=left.__getitem__)
+    late = best * CONTROL_PERIOD
+    if abs(late) >= least and left[best] < share * left[0]:
+        warnings.append(
+            f"bends go with the pressures {abs(late):.2f} s {'before' if late > 0 else 'after'} "
+            "them: put times of both on one clock in the log (of motion capture: poses_late), or "
+            "the limb's numbers are wrong"
+        )
