@@ -384,7 +384,7 @@ def _check_match(pressure: Array, bend: Array, warnings: list[str]) -> None:
         if abs(row[most]) > 1.5 * abs(row[index]):
             raise LogError(
                 f"segment {index} bends with input {most}, not with input {index}: columns or "
-                "tubes are swapped"
+                "tubes are swapped, or angles and pressures have two clocks"
             )
         if row[index] < 0:
             raise LogError(
