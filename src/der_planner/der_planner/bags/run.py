@@ -193,20 +193,16 @@ class RunSeries:
         held = pressures or PressureArrays()
         return cls(
             description=description,
-            reference=checked_stream(
-                description, "tip_reference", reference_time, tip_reference, 2
-            ),
-            predicted=checked_stream(
-                description, "tip_predicted", reference_time, tip_predicted, 2
-            ),
-            tip=checked_stream(description, "tip", time, tip, 2),
-            commanded=checked_stream(description, "commanded", held.time, held.commanded),
-            measured=checked_stream(description, "measured", held.time, held.measured),
-            setpoints=checked_stream(description, "setpoints", reference_time, setpoints),
+            reference=as_stream(description, "tip_reference", reference_time, tip_reference, 2),
+            predicted=as_stream(description, "tip_predicted", reference_time, tip_predicted, 2),
+            tip=as_stream(description, "tip", time, tip, 2),
+            commanded=as_stream(description, "commanded", held.time, held.commanded),
+            measured=as_stream(description, "measured", held.time, held.measured),
+            setpoints=as_stream(description, "setpoints", reference_time, setpoints),
         )
 
 
-def checked_stream(
+def as_stream(
     about: Description,
     name: str,
     time: ArrayLike | None,

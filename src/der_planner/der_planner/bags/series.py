@@ -30,7 +30,7 @@ from der_planner.bags.run import (
     EvaluationError,
     RunSeries,
     Stream,
-    checked_stream,
+    as_stream,
     method_name,
 )
 
@@ -119,8 +119,8 @@ def run_of(record: BagRecord, namespace: str, plan_id: str = "") -> RunSeries:
     wanted = np.array(plan.tip_reference).reshape(-1, 2)
     return RunSeries(
         description=about,
-        reference=checked_stream(about, "tip_reference", times, wanted, 2),
-        predicted=checked_stream(about, "tip_predicted", times, predicted, 2),
+        reference=as_stream(about, "tip_reference", times, wanted, 2),
+        predicted=as_stream(about, "tip_predicted", times, predicted, 2),
         tip=tip,
         bend_angle=stream(limb.angles, segment_count, origin),
         tip_covariance=stream(limb.covariance, 4, origin),

@@ -397,11 +397,10 @@ def _check_clocks(pressure: Array, bend: Array, warnings: list[str]) -> None:
     """Warn of bends that go with the pressures of another time."""
     farthest, least, share = OTHER_CLOCKS
     reach = round(farthest / CONTROL_PERIOD)
-    inner, left = bend[reach:-reach], {}
+    inner, ones, left = bend[reach:-reach], np.ones((len(pressure), 1)), {}
     for shift in range(-reach, reach + 1, 5):
-        moved = np.column_stack([np.roll(pressure, shift, axis=0), np.ones(len(pressure))])
-        design = moved[reach:-reach]
-        left[shift] = np.sum((inner - design @ np.linalg.lstsq(design, inner, rcond=None)[0]) ** 2)
+        design = np.hstack([np.roll(pressure, shift, axis=0), ones])[reach:-reach]
+        left[shift] = float(np.linalg.lstsq(design, inner, rcond=None)[1].sum())
     best = min(left, key=left.__getitem__)
     late = best * CONTROL_PERIOD
     if abs(late) >= least and left[best] < share * left[0]:

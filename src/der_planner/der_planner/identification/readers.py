@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import itertools
 import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, fields, replace
@@ -203,8 +202,8 @@ def read_csv(path: str | Path, columns: ColumnMap) -> CalibrationLog:
         LogError: a column is missing or no number, a unit is unknown, or time falls; the message
             names it.
     """
-    named = (columns.commanded, columns.chambers, columns.angles, columns.tip, columns.tags)
-    table = read_table(Path(path), {columns.time, *itertools.chain(*named)})
+    pressures, seen = columns.commanded + columns.chambers, columns.angles + columns.tip
+    table = read_table(Path(path), {columns.time, *pressures, *seen, *columns.tags})
     count = len(columns.chambers) // 2 if columns.poses else len(columns.angles)
     given = len(columns.commanded), len(columns.chambers)
     if not set(given) <= {count, 2 * count}:
