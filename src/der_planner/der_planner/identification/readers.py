@@ -64,7 +64,8 @@ def read_bag(path: str | Path, namespace: str = "") -> CalibrationLog:
     limb, stream = bag.limbs.get(chosen, record.LimbRecord()), series.stream
     if len(limb.measured) < LEAST_MESSAGES:
         raise LogError(
-            f"the bag {path} holds no pressures ({record.PRESSURE_TYPE}): was the driver running?"
+            f"the bag {path} holds no pressures ({record.PRESSURE_TYPE}): was the driver running? "
+            "A bag of other programs needs --columns FILE"
         )
     if np.isfinite(limb.tip.values(2)).all(axis=1).sum() < LEAST_MESSAGES:
         raise LogError(
