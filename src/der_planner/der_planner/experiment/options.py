@@ -214,8 +214,8 @@ class Options:
                 way of either; another limb than a twin is.
         """
         twin = Limb.default()
-        alike = limb.segment_count == twin.segment_count and limb.length < 1.3 * twin.length
-        if self.hardware is None and not (alike and limb.length > 0.7 * twin.length):
+        alike = limb.segment_count == twin.segment_count and 0.7 < limb.length / twin.length < 1.3
+        if self.hardware is None and not alike:
             raise PlanningError(
                 f"the twin has {twin.segment_count} segments and {twin.length:.3f} m, the limb "
                 f"'{limb.name}' {limb.segment_count} and {limb.length:.3f} m: play on its own rig "

@@ -71,11 +71,7 @@ def read_poses(path: Path) -> PoseLog:
 
 
 def lines_of(path: Path) -> list[str]:
-    """Return the lines that hold something; the first is the header.
-
-    Comments before it, which begin with ``#``, are left out, but for a last one that is the header
-    of numbers, as `numpy.savetxt` writes it.
-    """
+    """Return the lines that hold something, the header first: of `numpy.savetxt` a comment."""
     try:
         content = path.read_bytes()
     except OSError as error:

@@ -35,9 +35,8 @@ TOO_LARGE = 3.0
 ANOTHER_SIDE = math.radians(25.0)
 """Direction of the tips beside that of the bend angles above which their axes differ [rad]."""
 OTHER_CLOCKS = 3.0, 0.6, 0.25
-"""Clocks that are looked for differ by up to so much [s], and by this or more if it leaves so
-little of the squares that evenly bent segments miss: friction and slow air leave three times as
-much."""
+"""Clocks may differ by up to so much [s]; they do, by this or more, if it leaves this share of the
+squares that pressures do not explain. Friction and slow air leave twice as much."""
 LONGEST_SWING = 12.0
 """Longest time at the beginning of a log that is waited for a swing to end [s]."""
 
@@ -114,11 +113,9 @@ class CalibrationLog:
 
     def seen_earlier(self, seconds: float, longest_gap: float = LONGEST_GAP) -> CalibrationLog:
         """Return the log with what was seen put to instants that are earlier by some seconds."""
-
-        def moved(table: Array) -> Array:
-            return on_grid(self.time - seconds, table, self.time, longest_gap)
-
-        return replace(self, bend_angles=moved(self.bend_angles), tip=moved(self.tip))
+        seen, earlier = (self.bend_angles, self.tip), self.time - seconds
+        angles, tip = (on_grid(earlier, table, self.time, longest_gap) for table in seen)
+        return replace(self, bend_angles=angles, tip=tip)
 
     def _of(self, time: Array, table: Callable[[Array], Array]) -> CalibrationLog:
         """Return the log at other instants, its tables changed by a function."""
@@ -185,9 +182,8 @@ class Prepared:
     def without(self, rows: NDArray[np.bool_]) -> Prepared:
         """Return the log with rows (K,) more that are not fitted to."""
         missing = np.where(rows, np.nan, 0.0)[:, None]
-        log = replace(
-            self.log, bend_angles=self.log.bend_angles + missing, tip=self.log.tip + missing
-        )
+        angles, tip = self.log.bend_angles + missing, self.log.tip + missing
+        log = replace(self.log, bend_angles=angles, tip=tip)
         return replace(self, log=log, usable=self.usable & ~rows)
 
 
