@@ -84,6 +84,13 @@ def test_a_map_that_fits_nothing_gives_no_pose(tags, model):
     assert world.problem
 
 
+def test_without_any_fixed_tag_their_ids_and_what_to_compare_are_named(tags, model):
+    world = WorldPose(tags, model.intrinsics)
+    assert world.update([]) is None
+    assert "(100, 101, 102, 103, 104, 105)" in world.problem
+    assert "ids and family" in world.problem
+
+
 def test_the_pose_stays_while_fixed_tags_are_covered(tags, model):
     world = WorldPose(tags, model.intrinsics)
     world.update(tags_seen(tags, model, model.pose))

@@ -96,6 +96,14 @@ def test_a_dry_run_plans_the_path_and_names_a_twin_that_the_limb_file_is_not_of(
     assert (found, "warning" in said) == (0, False)
 
 
+def test_a_limb_unlike_the_twin_does_not_play_on_it(call, tmp_path):
+    segment, file = Limb.default().segments[0], tmp_path / "limb.yaml"
+    for segments in ((segment,), (replace(segment, length=0.04),) * 2):
+        replace(Limb.default(), segments=segments).to_yaml(file)
+        found, said = call("der_planner.commands.run_experiment", "--dry-run", "--limb", str(file))
+        assert (found, "the twin has 2 segments and 0.244 m" in said) == (1, True)
+
+
 def test_pressures_beyond_the_limit_start_nothing(call, tmp_path):
     table, out = tmp_path / "excitation.csv", str(tmp_path / "limb.yaml")
     table.write_text("time_s,a,b\n0,0,0\n0.05,0,30000\n")

@@ -240,13 +240,20 @@ def test_what_is_seen_late_is_told_and_taken_out_of_the_fit(fitted):
     assert abs(late) < max(4.0 * deviation, 0.004)
     assert report.taken_out == 0.0
     log = synthetic_log(Limb.default()).between(40.0, 68.0)
-    seen = [np.interp(log.time - 0.03, log.time, column) for column in log.bend_angles.T]
-    _, told = fit(
-        Limb.default(), replace(log, bend_angles=np.stack(seen, axis=1)), terms=["dynamics"]
-    )
+    late = replace(log, bend_angles=log.seen_earlier(-0.03).bend_angles)
+    _, told = fit(Limb.default(), late, terms=["dynamics"])
     assert told.delay[0] == pytest.approx(0.03, abs=0.004)
     assert abs(told.delay[0] - told.taken_out) < max(4.0 * told.delay[1], 0.002)
     assert abs(told.value("log_damping").value) < 0.5
+
+
+def test_a_small_lead_is_told_and_stays_since_no_camera_leads():
+    log = synthetic_log(Limb.default()).between(40.0, 68.0)
+    for lead, taken_out in ((0.05, 0.0), (0.25, -0.25)):
+        early = replace(log, bend_angles=log.seen_earlier(lead).bend_angles)
+        _, told = fit(Limb.default(), early, terms=["dynamics"])
+        assert told.taken_out == pytest.approx(taken_out, rel=0.4)
+        assert "early, as no camera is" in told.text()
 
 
 def test_a_number_at_the_end_of_its_range_names_what_would_tell_it():

@@ -106,8 +106,12 @@ def test_map_files_are_read_and_wrong_keys_and_values_are_named(tmp_path, line, 
             "cp1252"
         ),
         (ROWS + "0.5,40,10").encode(),
+        ("# rig 3\n# " + ROWS).encode(),
+        ROWS.replace(",", "   ").encode(),
+        "".join(f"{row},{'on' if n else 'mode'}\n" for n, row in enumerate(ROWS.split())).encode(),
     ],
-    ids=["crlf", "bom", "utf16", "comment", "semicolon", "tabs", "quotes", "cp1252", "cut-short"],
+    ids=["crlf", "bom", "utf16", "comment", "semicolon", "tabs", "quotes", "cp1252", "cut-short",
+         "savetxt", "blanks", "text"],
 )  # fmt: skip
 def test_tables_of_other_programs_are_read_alike(tmp_path, table, written):
     expected = read_csv(table, ColumnMap(**COLUMNS))
@@ -137,6 +141,7 @@ def test_rows_need_a_time_of_their_own(tmp_path, table):
         ("t,u\n0,1,2\n1,2,3\n", "have 3 columns, its header has 2"),
         ("t,u,u\n0,1,2\n1,2,3\n", "two columns 'u'"),
         ("t,u\n", "fewer than two rows"),
+        ("PK\0\0 of a spreadsheet", "is no text: write it as CSV"),
     ],
 )
 def test_damaged_tables_are_refused(tmp_path, written, said):
@@ -223,12 +228,28 @@ def test_other_units_are_named(door):
         prepare(replace(log, **change(log)), LIMB, to_fit=False)
 
 
+def test_milliseconds_of_a_fast_log_are_no_seconds():
+    still = np.zeros((20_000, 2))
+    log = CalibrationLog(np.arange(20e3), still, still, still, still)
+    with pytest.raises(
+        LogError, match=r"lasts 2e\+04 s, with a row every 1 s: give the time in sec"
+    ):
+        prepare(log, LIMB, to_fit=False)
+
+
 @pytest.mark.parametrize("wrong", [lambda tip: tip[:, ::-1], lambda tip: tip * [1.0, -1.0]])
 def test_tips_in_other_axes_than_the_limbs_are_refused(wrong):
     log = slow_log()
     prepare(log, LIMB)
     with pytest.raises(LogError, match="x points along the straight limb"):
         prepare(replace(log, tip=wrong(log.tip)), LIMB)
+
+
+@pytest.mark.parametrize(("late", "said"), [(1.0, "1.00 s before"), (-1.0, "1.00 s after")])
+def test_pressures_and_bends_of_two_clocks_are_said(late, said):
+    log = slow_log()
+    assert said in prepare(log.seen_earlier(-late), LIMB).warnings[-1]
+    assert prepare(log.seen_earlier(-0.2 * late), LIMB).warnings == ()
 
 
 def test_single_impossible_numbers_are_left_out_and_said():

@@ -70,6 +70,14 @@ def test_a_path_without_times_keeps_the_limits():
     np.testing.assert_allclose(tip[[0, -1]], points[[0, -1]], atol=1e-6)
 
 
+def test_a_tip_that_is_to_wait_waits():
+    here, there = [0.22, 0.08], [0.20, 0.11]
+    path = TipPath.build([0.0, 2.0, 6.0, 8.0], [here, there, there, here])
+    time, tip = path.resample(0.02)
+    waits = (time >= 2.0) & (time <= 6.0)
+    np.testing.assert_allclose(tip[waits], np.tile(there, (waits.sum(), 1)), atol=1e-12)
+
+
 def test_csv_paths(tmp_path):
     file = tmp_path / "spot.csv"
     file.write_text("time, x, y\n0, 0.20, 0.10\n1, 0.195, 0.11\n2, 0.19, 0.12\n")

@@ -124,6 +124,16 @@ def test_a_path_through_the_straight_pose_is_smooth():
         )
 
 
+@pytest.mark.parametrize("segments", [3, 4])
+def test_a_limb_of_many_segments_rests_where_its_path_rests(segments):
+    """What the tip leaves open must not drift, or the limb would never come home from there."""
+    space = Workspace(ArcModel(replace(LIMB, segments=LIMB.segments[:1] * segments)))
+    for shape in ("circle", "figure_eight"):
+        reference = Motion.named(shape, amplitude=0.5, cycles=1).reference(space)
+        assert np.all(reference.bend_angles < space.high)
+        assert np.abs(np.diff(reference.bend_angles, axis=0)).max() < 0.05 * space.fastest.max()
+
+
 def test_distance_to_reach_agrees_with_a_search():
     low, high = SPACE.low, SPACE.high
     grid = np.stack(

@@ -163,6 +163,22 @@ def test_bag_without_plan_or_states_is_refused(tmp_path: Path):
     bag.bag.close()
     with pytest.raises(EvaluationError, match="see whether the tracker ran"):
         load_run(tmp_path / "no_state")
+    bag = BagOfRun(tmp_path / "elsewhere")
+    bag.plan()
+    bag.state(0.0, (0.2, 0.0), topic="/camera/state")
+    bag.bag.close()
+    with pytest.raises(EvaluationError, match="states in /camera, where no plan is: remap them"):
+        load_run(tmp_path / "elsewhere", namespace="/limb")
+
+
+def test_a_plan_of_others_needs_a_reference_and_no_prediction(tmp_path: Path):
+    BagOfRun(tmp_path / "run").still_run(OFFSET, tip_predicted=np.zeros(0))
+    result = evaluate_run(load_run(tmp_path / "run"))
+    assert result.mean_error_m == pytest.approx(0.005, abs=3e-5)
+    assert np.isnan(result.predicted_error_m)
+    BagOfRun(tmp_path / "short").still_run(OFFSET, tip_reference=np.zeros(4))
+    with pytest.raises(EvaluationError, match="tip_reference must have shape"):
+        load_run(tmp_path / "short")
 
 
 def test_the_plan_that_was_played_is_chosen(tmp_path: Path):

@@ -82,7 +82,10 @@ class WorldPose:
         self.bumps = 0
         self.excluded: dict[int, float] = {}
         """Fixed tags that do not fit the others, with their residual [px]."""
-        self.problem = "no fixed tag has been seen yet"
+        self.problem = (
+            f"no fixed tag ({', '.join(map(str, self._places))}) has been seen yet: aim and focus "
+            "the camera, compare ids and family with the tag map; a mirrored picture shows none"
+        )
 
     def update(self, tags: Sequence[Tag]) -> CameraPose | None:
         """Take the fixed tags of one image and return the pose to use for it, None without one."""

@@ -193,16 +193,16 @@ class RunSeries:
         held = pressures or PressureArrays()
         return cls(
             description=description,
-            reference=_stream(description, "tip_reference", reference_time, tip_reference, 2),
-            predicted=_stream(description, "tip_predicted", reference_time, tip_predicted, 2),
-            tip=_stream(description, "tip", time, tip, 2),
-            commanded=_stream(description, "commanded", held.time, held.commanded),
-            measured=_stream(description, "measured", held.time, held.measured),
-            setpoints=_stream(description, "setpoints", reference_time, setpoints),
+            reference=as_stream(description, "tip_reference", reference_time, tip_reference, 2),
+            predicted=as_stream(description, "tip_predicted", reference_time, tip_predicted, 2),
+            tip=as_stream(description, "tip", time, tip, 2),
+            commanded=as_stream(description, "commanded", held.time, held.commanded),
+            measured=as_stream(description, "measured", held.time, held.measured),
+            setpoints=as_stream(description, "setpoints", reference_time, setpoints),
         )
 
 
-def _stream(
+def as_stream(
     about: Description,
     name: str,
     time: ArrayLike | None,

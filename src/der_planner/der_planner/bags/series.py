@@ -30,6 +30,7 @@ from der_planner.bags.run import (
     EvaluationError,
     RunSeries,
     Stream,
+    as_stream,
     method_name,
 )
 
@@ -106,14 +107,20 @@ def run_of(record: BagRecord, namespace: str, plan_id: str = "") -> RunSeries:
     faults = [text for when, text in limb.faults if 0 <= (when - origin) / NANOSECONDS <= end]
     tip = stream(limb.tip, 2, origin)
     if not len(tip) or tip.time[-1] < 0 or tip.time[0] > end:
+        apart = [name for name, one in record.limbs.items() if len(one.tip) and not one.plans]
         raise EvaluationError(
             f"{where}: no limb state was recorded while the plan was played: see whether "
             "the tracker ran, and the camera's stamps are of the planner's clock"
+            + "".join(f"; states in {name}, where no plan is: remap them" for name in apart)
         )
+    about = _describe(plan, record, namespace, feedback)
+    # Planners of other people need not predict anything.
+    predicted = np.array(plan.tip_predicted).reshape(-1, 2) if len(plan.tip_predicted) else None
+    wanted = np.array(plan.tip_reference).reshape(-1, 2)
     return RunSeries(
-        description=_describe(plan, record, namespace, feedback),
-        reference=Stream(times, np.array(plan.tip_reference).reshape(-1, 2)),
-        predicted=Stream(times, np.array(plan.tip_predicted).reshape(-1, 2)),
+        description=about,
+        reference=as_stream(about, "tip_reference", times, wanted, 2),
+        predicted=as_stream(about, "tip_predicted", times, predicted, 2),
         tip=tip,
         bend_angle=stream(limb.angles, segment_count, origin),
         tip_covariance=stream(limb.covariance, 4, origin),

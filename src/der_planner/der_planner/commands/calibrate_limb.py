@@ -325,7 +325,7 @@ def _columns(given: argparse.Namespace) -> Path | None:
         return path
     if is_bag(given.log) and is_ours(given.log):
         return None
-    names = list(read_table(given.log))
+    names = list(read_table(given.log, ()))
     if not sys.stdin.isatty():
         raise LogError(
             f"{given.log} needs {path}, a map of its columns {', '.join(names)}: run this in a "

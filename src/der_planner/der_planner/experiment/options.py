@@ -211,8 +211,16 @@ class Options:
 
         Raises:
             PlanningError: numbers of a motion, a path that is out of reach, or obstacles in the
-                way of either.
+                way of either; another limb than a twin is.
         """
+        twin = Limb.default()
+        alike = limb.segment_count == twin.segment_count and 0.7 < limb.length / twin.length < 1.3
+        if self.hardware is None and not alike:
+            raise PlanningError(
+                f"the twin has {twin.segment_count} segments and {twin.length:.3f} m, the limb "
+                f"'{limb.name}' {limb.segment_count} and {limb.length:.3f} m: play on its own rig "
+                "(--hardware), or on its own model by a study (task: model)"
+            )
         rod = None if self.calibrate else RodModel(limb)
         for name, model in {(trial.motion, trial.model) for trial in trials}:
             motion = self.motion(name)

@@ -62,8 +62,9 @@ EVEN_ERROR = np.deg2rad(5.0)
 """Error of the bend angle of an evenly bent segment in the start in closed form [rad]."""
 LARGEST_CHANGE = 0.6
 """Largest change of the logarithm of the stiffness in the start in closed form."""
-SHORTEST_DELAY = 0.005
-"""A fit is repeated without a delay of what was seen from this on [s]."""
+SHORTEST_DELAY, SHORTEST_LEAD = 0.005, 0.15
+"""A fit is repeated without a delay of what was seen from this on, or a lead [s]. No camera leads:
+up to 0.1 s are friction that passes for a lead, and without it other logs are predicted worse."""
 STIFFER_STARTS = (0.0, 0.25, 0.5, 0.9)
 """Added to the logarithm of the stiffness, or taken off that of the mass, until the rod can follow
 the log from there."""
@@ -162,7 +163,8 @@ def _fit(
         unknowns += left
         warnings.append(said)
     late, doubt = fitted.problem.delay(fitted.values)
-    if not taken_out and abs(late) >= max(SHORTEST_DELAY, 3.0 * doubt):
+    shortest = SHORTEST_DELAY if late > 0.0 else SHORTEST_LEAD
+    if not taken_out and abs(late) >= max(shortest, 3.0 * doubt):
         # What was seen late would pass for damping and inertia.
         earlier = log.seen_earlier(late, longest_gap)
         return _fit(limb, earlier, groups, longest_gap, weight, late)

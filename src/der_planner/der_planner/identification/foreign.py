@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import codecs
 import csv
+import re
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -80,21 +81,25 @@ def read_poses(path: Path) -> PoseLog:
 
 
 def lines_of(path: Path) -> list[str]:
-    """Return the lines that hold something; the first is the header."""
+    """Return the lines that hold something, the header first: of `numpy.savetxt` a comment."""
     try:
         content = path.read_bytes()
     except OSError as error:
         raise LogError(f"cannot read the log {path}: {error.strerror}") from error
     wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    if b"\0" in content and not wide:
+        raise LogError(f"the log {path} is no text: write it as CSV")
     try:
         text = content.decode("utf-16" if wide else "utf-8-sig")
     except UnicodeDecodeError:
         # Names of columns may hold a degree sign of an older program.
         text = content.decode("cp1252", errors="replace")
-    written = (line for line in text.splitlines() if line.strip())
+    written = [line for line in text.splitlines() if line.strip()]
     lines = list(dropwhile(lambda line: line.lstrip().startswith("#"), written))
     if not lines:
         raise LogError(f"the log {path} is empty")
+    if len(lines) < len(written) and re.match(r'[\s"]*[-+.\d]', lines[0]):
+        lines.insert(0, written[-len(lines) - 1].lstrip("# "))
     return lines
 
 

@@ -26,14 +26,17 @@ SWING = np.deg2rad(0.5)
 """Amplitude below which a swing need not be waited for [rad]."""
 LONGEST_PERIOD = 5.0
 """Median time between two rows above which the time must have another unit [s]."""
-LEAST_DURATION = 1.0
-"""Duration below which it must, too [s]."""
+LEAST_DURATION, LONGEST_DURATION = 1.0, 1e4
+"""Durations below and above which it must, too [s]."""
 LEAST_MOTION = np.deg2rad(3.0)
 """Range of motion from which on gains are judged [rad]."""
 TOO_LARGE = 3.0
 """Largest differential pressure, over the prior's limit, that is not taken for another unit."""
 ANOTHER_SIDE = math.radians(25.0)
 """Direction of the tips beside that of the bend angles above which their axes differ [rad]."""
+OTHER_CLOCKS = 3.0, 0.6, 0.25
+"""Clocks may differ by up to so much [s]; they do, by this or more, if it leaves this share of the
+squares that pressures do not explain. Friction and slow air leave twice as much."""
 LONGEST_SWING = 12.0
 """Longest time at the beginning of a log that is waited for a swing to end [s]."""
 
@@ -110,11 +113,9 @@ class CalibrationLog:
 
     def seen_earlier(self, seconds: float, longest_gap: float = LONGEST_GAP) -> CalibrationLog:
         """Return the log with what was seen put to instants that are earlier by some seconds."""
-
-        def moved(table: Array) -> Array:
-            return on_grid(self.time - seconds, table, self.time, longest_gap)
-
-        return replace(self, bend_angles=moved(self.bend_angles), tip=moved(self.tip))
+        seen, earlier = (self.bend_angles, self.tip), self.time - seconds
+        angles, tip = (on_grid(earlier, table, self.time, longest_gap) for table in seen)
+        return replace(self, bend_angles=angles, tip=tip)
 
     def _of(self, time: Array, table: Callable[[Array], Array]) -> CalibrationLog:
         """Return the log at other instants, its tables changed by a function."""
@@ -181,9 +182,8 @@ class Prepared:
     def without(self, rows: NDArray[np.bool_]) -> Prepared:
         """Return the log with rows (K,) more that are not fitted to."""
         missing = np.where(rows, np.nan, 0.0)[:, None]
-        log = replace(
-            self.log, bend_angles=self.log.bend_angles + missing, tip=self.log.tip + missing
-        )
+        angles, tip = self.log.bend_angles + missing, self.log.tip + missing
+        log = replace(self.log, bend_angles=angles, tip=tip)
         return replace(self, log=log, usable=self.usable & ~rows)
 
 
@@ -237,6 +237,7 @@ def prepare(
         _check_commands(grid, least_excitation)
         _check_excitation(pressure[valid & ~swinging], least_excitation)
         _check_match(pressure, bend, warnings)
+        _check_clocks(pressure, bend, warnings)
         _check_axes(grid, limb)
     if swinging.any():
         grid.bend_angles[swinging], grid.tip[swinging] = np.nan, np.nan
@@ -268,7 +269,7 @@ def _still_swinging(time: Array, pressure: Array, bend: Array, limb: Limb) -> ND
 def _check_time(log: CalibrationLog) -> None:
     """Refuse a log whose time is not in seconds."""
     period, duration = float(np.median(np.diff(log.time))), float(np.ptp(log.time))
-    if period > LONGEST_PERIOD or duration < LEAST_DURATION:
+    if period > LONGEST_PERIOD or not LEAST_DURATION <= duration <= LONGEST_DURATION:
         raise LogError(
             f"the log lasts {duration:.3g} s, with a row every {period:.3g} s: give the time in "
             "seconds, or name its unit in columns.yaml (time_unit)"
@@ -379,10 +380,28 @@ def _check_match(pressure: Array, bend: Array, warnings: list[str]) -> None:
         if abs(row[most]) > 1.5 * abs(row[index]):
             raise LogError(
                 f"segment {index} bends with input {most}, not with input {index}: columns or "
-                "tubes are swapped"
+                "tubes are swapped, or angles and pressures have two clocks"
             )
         if row[index] < 0:
             raise LogError(
                 f"segment {index} bends the wrong way: positive differential pressure must bend "
                 "toward +y; swap the two chambers or the sign in the column map"
             )
+
+
+def _check_clocks(pressure: Array, bend: Array, warnings: list[str]) -> None:
+    """Warn of bends that go with the pressures of another time."""
+    farthest, least, share = OTHER_CLOCKS
+    reach = round(farthest / CONTROL_PERIOD)
+    inner, ones, left = bend[reach:-reach], np.ones((len(pressure), 1)), {}
+    for shift in range(-reach, reach + 1, 5):
+        design = np.hstack([np.roll(pressure, shift, axis=0), ones])[reach:-reach]
+        left[shift] = float(np.linalg.lstsq(design, inner, rcond=None)[1].sum())
+    best = min(left, key=left.__getitem__)
+    late = best * CONTROL_PERIOD
+    if abs(late) >= least and left[best] < share * left[0]:
+        warnings.append(
+            f"bends go with the pressures {abs(late):.2f} s {'before' if late > 0 else 'after'} "
+            "them: put times of both on one clock in the log (of motion capture: poses_late), or "
+            "the limb's numbers are wrong"
+        )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -41,7 +41,7 @@ REST_SHARE = 0.02
 VENTING_TIME = 5.0
 """Time that chambers need to be at rest after they were filled [s]."""
 SEPARATORS = "\t;,"
-"""Separators of columns; a table has the first of these that its header holds."""
+"""Separators of columns; a table has the first of these that its header holds, or blanks."""
 
 
 def read_bag(path: str | Path, namespace: str = "") -> CalibrationLog:
@@ -66,7 +66,8 @@ def read_bag(path: str | Path, namespace: str = "") -> CalibrationLog:
     limb, stream = bag.limbs.get(chosen, record.LimbRecord()), series.stream
     if len(limb.measured) < LEAST_MESSAGES:
         raise LogError(
-            f"the bag {path} holds no pressures ({record.PRESSURE_TYPE}): was the driver running?"
+            f"the bag {path} holds no pressures ({record.PRESSURE_TYPE}): was the driver running? "
+            "A bag of other programs needs --columns FILE"
         )
     if np.isfinite(limb.tip.values(2)).all(axis=1).sum() < LEAST_MESSAGES:
         raise LogError(
@@ -254,7 +255,8 @@ def read_csv(path: str | Path, columns: ColumnMap) -> CalibrationLog:
         LogError: a column is missing or no number, a unit is unknown, or time falls; the message
             names it.
     """
-    table = read_table(Path(path))
+    pressures, seen = columns.commanded + columns.chambers, columns.angles + columns.tip
+    table = read_table(Path(path), {columns.time, *pressures, *seen, *columns.tags})
     count = len(columns.chambers) // 2 if columns.poses else len(columns.angles)
     given = len(columns.commanded), len(columns.chambers)
     if not set(given) <= {count, 2 * count}:
@@ -352,14 +354,14 @@ def _rest(time: Array, command: Array, rest_until: float | str) -> NDArray[np.bo
     return rest
 
 
-def read_table(path: Path) -> dict[str, Array]:
+def read_table(path: Path, wanted: Collection[str]) -> dict[str, Array]:
     """Return the columns (K,) of a table by the names in its header; missing numbers are NaN.
 
     A bag has columns as `read_bag_table` says.
 
-    Lines before the header that begin with ``#`` and empty lines are skipped, and a last row that
-    ends early, as that of a program that was killed, is left out. Numbers may have a decimal comma
-    where columns are separated by something else, or in quotes.
+    Empty lines are skipped, and a last row that ends early, as that of a program that was killed,
+    is left out. Numbers may have a decimal comma where columns are separated by something else, or
+    in quotes. Columns that are not wanted may hold anything, and are NaN.
 
     Raises:
         LogError: the file cannot be read, names a column twice, has fewer than two rows or another
@@ -368,7 +370,9 @@ def read_table(path: Path) -> dict[str, Array]:
     if is_bag(path):
         return read_bag_table(path)
     header_line, *lines = lines_of(path)
-    separator = next((mark for mark in SEPARATORS if mark in header_line), ",")
+    separator = next((mark for mark in SEPARATORS if mark in header_line), " ")
+    if separator == " ":
+        header_line, *lines = (" ".join(line.split()) for line in (header_line, *lines))
     header = [name.strip() for name in next(csv.reader([header_line], delimiter=separator))]
     twice = [name for name in header if name and header.count(name) > 1]
     if twice:
@@ -377,14 +381,17 @@ def read_table(path: Path) -> dict[str, Array]:
         lines.pop()
     if len(lines) < 2:
         raise LogError(f"the log {path} has fewer than two rows below its header")
+    kinds: dict[int | str, Callable[[str], float]] = {
+        k: _number if name in wanted else (lambda _: math.nan) for k, name in enumerate(header)
+    }
     try:
         values = np.loadtxt(
-            lines, delimiter=separator, converters=_number, quotechar='"', comments=None, ndmin=2
+            lines, delimiter=separator, converters=kinds, quotechar='"', comments=None, ndmin=2
         )
     except ValueError as error:
         raise LogError(
-            f"the log {path}, row 0 being the one below its header: {error}; leave cells without a "
-            "value empty, or write NaN"
+            f"the log {path}, row 0 being the one below its first line, the header: {error}; a "
+            "cell holds a number (a time, too, in s, ms or us), NaN or nothing"
         ) from error
     if values.shape[1] != len(header):
         raise LogError(

@@ -129,7 +129,7 @@ class FitReport:
         if late < -3.0 * deviation:
             lines.append(
                 f"what was seen is {-1e3 * late:.0f} ± {1e3 * deviation:.0f} ms early, as no "
-                "camera is: check the clocks of the log, and mass and lengths of the limb"
+                "camera is: friction may pass for some of it; check clocks, mass and lengths"
             )
         if late > 3.0 * deviation:
             lines.append(

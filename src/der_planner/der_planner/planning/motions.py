@@ -288,9 +288,9 @@ class Motion:
         if _beyond(workspace, joined[1]) and not _beyond(workspace, angles):
             ends = np.linalg.norm(np.gradient(tip, time, axis=0)[[0, -1]], axis=1)
             raise PlanningError(
-                f"the path begins or ends in motion, at up to {ends.max():.2g} m/s: on the way "
-                "there or back the limb would swing beyond its reach. Let it begin and end "
-                "slower, or follow the nearest path (nearest=True; --nearest)"
+                f"the path begins or ends in motion, at up to {ends.max():.2g} m/s, or in noise: "
+                "on the way there or back the limb would swing beyond its reach. Let it begin and "
+                "end slower, or follow the nearest path (nearest=True; --nearest)"
             )
         return (*joined, None)
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.interpolate import make_interp_spline
+from scipy.interpolate import PchipInterpolator, make_interp_spline
 
 from der_planner.arrays import Array, interpolate
 from der_planner.model.bending import Kinematics
@@ -90,6 +90,9 @@ class TipPath:
         instants = np.linspace(0.0, self.duration, max(8, round(self.duration / step) + 1))
         if self.exact or len(self.time) < 4:
             points = interpolate(instants, self.time, self.tip)
+        elif np.any(np.all(np.diff(self.tip, axis=0) == 0.0, axis=1)):
+            # A spline would swing about the point where the tip is to wait.
+            points = PchipInterpolator(self.time, self.tip)(instants)
         else:
             points = make_interp_spline(self.time, self.tip, k=3)(instants)
         return instants, points
