@@ -11,7 +11,7 @@ something is touched, `yield` gives no command u with −ℓ·u above that of th
 moved to the nearest command on that side, until nothing is suspected any more. To retreat farther
 than the plan would do harm where a touch is false.
 
-With a limit in N the bound is where the force f, with its deviation, would reach it: a change
+With a limit in N the bound is where the force f, with two deviations, would reach it: a change
 −ℓ·δu is taken to raise the force by |f|/|ℓ|² of it. Until the force can be told, pressures stay
 where the plan had them at the touch. A touch ends once the limb has gone back; the bound stays
 until the plan itself has gone back behind it.
@@ -98,8 +98,8 @@ class Reaction:
         size = float(np.linalg.norm(touch.force))
         if self.limit is not None and size > 0.0:
             along = touch.force / size
-            # The force may be larger than told by its standard deviation.
-            most = size + math.sqrt(float(along @ touch.force_covariance @ along))
+            # Friction bears a part of the force: it may be larger by two standard deviations.
+            most = size + 2.0 * math.sqrt(float(along @ touch.force_covariance @ along))
             harder = -size / square * touch.pressure
             self._bound = harder, float(harder @ chambers) + self.limit - most
         elif self.limit is None or begins:
