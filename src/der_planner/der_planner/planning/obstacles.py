@@ -161,7 +161,7 @@ class Obstacles:
         if not isinstance(content, Mapping) or set(content) != {"limb_radius_m", "obstacles"}:
             found = ", ".join(map(str, content)) if isinstance(content, Mapping) else content
             raise ValueError(f"the two keys limb_radius_m and obstacles are expected, got {found}")
-        items = tuple(_obstacle(item) for item in content["obstacles"])
+        items = tuple(_obstacle(item) for item in content["obstacles"] or ())
         return Obstacles(_number(content["limb_radius_m"], "limb_radius_m"), items)
 
     @property
