@@ -119,7 +119,7 @@ class TouchSense:
         goes_on = self._rate * self._slid > 0.0
         self._slid = np.where(goes_on, self._slid, 0.0) + passed * rate
         lacking = Lacking.of(time, self._model.limb, known, bend, self._rate, self._slid)
-        # A doubt fades no faster than the estimator follows.
+        # Doubts of friction and of the swinging mass fade no faster than the estimator follows.
         kept = np.exp(-passed / _FOLLOWS)
         least, most = lacking.stuck
         self._stuck = np.stack(

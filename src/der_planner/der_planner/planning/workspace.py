@@ -336,10 +336,10 @@ class Workspace:
 
     def _continue(self, points: Array, start: Array) -> Array:
         """Return bend angles (K, M) along points (K, 2), each from where the last two lead."""
-        # What points leave open of more than two segments would drift on for ever.
         angles, guess = np.zeros((len(points), len(start))), start
         for k, point in enumerate(points):
             angles[k] = inverse_kinematics(self.arcs, point[None], guess[None])[0][0]
+            # What a point leaves open of more than two segments would drift on for ever.
             guess = 2 * angles[k] - angles[k - 1] if k and len(start) <= 2 else angles[k]
         return angles
 
