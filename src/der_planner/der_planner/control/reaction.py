@@ -11,10 +11,11 @@ something is touched, `yield` gives no command u with −ℓ·u above that of th
 moved to the nearest command on that side, until nothing is suspected any more. To retreat farther
 than the plan would do harm where a touch is false.
 
-With a limit in N the bound is where the force f, with two deviations, would reach it: a change
-−ℓ·δu is taken to raise the force by |f|/|ℓ|² of it. Until the force can be told, pressures stay
-where the plan had them at the touch. A touch ends once the limb has gone back; the bound stays
-until the plan itself has gone back behind it.
+With a limit in N pressures stay where they are at the touch until its force can be told: they may
+go back, but not along the obstacle, since its direction is not known well either. From then on the
+bound moves slowly to where the force f, with two deviations, would reach the limit: a change −ℓ·δu
+is taken to raise the force by |f|/|ℓ|² of it. Once the limb has gone back and nothing is touched,
+the bound moves on slowly until the plan is behind it.
 """
 
 from __future__ import annotations
@@ -34,6 +35,10 @@ _RETURN = 4.0
 """Time in which corrections come back once a touch has ended [s]."""
 _SMALLEST = 1e-9
 """A pressure below this gives no direction [Pa]."""
+_TOWARDS = 0.25
+"""Share of the way to the limit that chambers are asked for at once: forces are told late."""
+_ADVANCE = 1500.0
+"""Speed at which the bound moves on where nothing is touched any more [Pa/s]."""
 
 
 class Reaction:
@@ -61,8 +66,8 @@ class Reaction:
             )
         self.kind, self.limit = kind, limit
         self.vents = False
-        self._held: Array | None = None
-        self._bound = np.zeros(model.inputs), 0.0
+        # Pressures, the direction from them that presses harder, and whether others may change.
+        self._bound: tuple[Array, Array, bool] | None = None
         self._free, self._kept = 1.0, np.zeros(model.inputs)
         self._newest, self._suspected = self._kept, False
 
@@ -79,36 +84,42 @@ class Reaction:
             touch: as it is known now.
             chambers: (M,) differential pressures in them now [Pa].
         """
-        harder, bound = self._bound
         self._suspected = touch.suspected and self.acts
         self.vents = self.kind == "vent" and touch.touched and touch.time > touch.since
-        if not (touch.touched and self.acts):
-            yields = self.kind == "yield" and self._held is not None
-            if yields and self.limit is None and touch.suspected:
-                self._bound = harder, float(harder @ planned)
-            elif not (yields and self.limit is not None and harder @ planned > bound):
-                self._held = None
-            return
-        begins = self._held is None
-        if self._held is None:
-            self._held = chambers
-        if self.kind != "yield":
-            return
-        square = max(float(touch.pressure @ touch.pressure), _SMALLEST**2)
+        if touch.touched and self.acts:
+            self._bound = self._bound_of(planned, touch, chambers)
+        elif self._bound is not None:
+            self._bound = self._bound_after(self._bound, planned)
+
+    def _bound_of(self, planned: Array, touch: Touch, chambers: Array) -> tuple[Array, Array, bool]:
+        """Return the bound while something is touched; arguments as of `follow`."""
+        length = max(float(np.linalg.norm(touch.pressure)), _SMALLEST)
+        harder: Array = -touch.pressure / length
+        if self.kind == "yield" and self.limit is None:
+            return planned, harder, True
         size = float(np.linalg.norm(touch.force))
-        if self.limit is not None and size > 0.0:
-            along = touch.force / size
-            # Friction bears a part of the force: it may be larger by two standard deviations.
-            most = size + 2.0 * math.sqrt(float(along @ touch.force_covariance @ along))
-            harder = -size / square * touch.pressure
-            self._bound = harder, float(harder @ chambers) + self.limit - most
-        elif self.limit is None or begins:
-            harder = -touch.pressure / math.sqrt(square)
-            self._bound = harder, float(harder @ planned)
+        if self.limit is None or not size > 0.0:
+            held, harder, _ = self._bound or (chambers, harder, False)
+            return held, harder, False
+        along = touch.force / size
+        # Friction bears a part of the force: it may be larger by two standard deviations.
+        most = size + 2.0 * math.sqrt(float(along @ touch.force_covariance @ along))
+        return chambers + _TOWARDS * (self.limit - most) * length / size * harder, harder, True
+
+    def _bound_after(
+        self, bound: tuple[Array, Array, bool], planned: Array
+    ) -> tuple[Array, Array, bool] | None:
+        """Return what is left of a bound once nothing is touched."""
+        held, harder, others = bound
+        if self.kind == "yield" and self.limit is None and self._suspected:
+            return planned, harder, True
+        if self.limit is not None and harder @ (planned - held) > 0.0:
+            return held + _ADVANCE * CONTROL_PERIOD * harder, harder, others
+        return None
 
     def corrected(self, wanted: Array) -> Array:
         """Return the correction (M,) [Pa] of this control period in place of a wanted one."""
-        if self._held is None:
+        if self._bound is None:
             self._free = min(1.0, self._free + CONTROL_PERIOD / _RETURN)
         elif self._free > 0.0:
             self._free, self._kept = 0.0, self._newest
@@ -117,14 +128,13 @@ class Reaction:
 
     def allowed(self, wanted: Array) -> Array:
         """Return the command (M,) [Pa] in place of a wanted one; from any thread."""
-        held = self._held
-        if held is None:
+        if self._bound is None:
             return wanted
+        held, harder, others = self._bound
         if self.kind != "yield":
             return held
-        harder, bound = self._bound
-        square = max(float(harder @ harder), _SMALLEST**2)
-        return wanted - harder * (max(0.0, float(harder @ wanted) - bound) / square)
+        further = float(harder @ (wanted - held))
+        return wanted - max(0.0, further) * harder if others else held + min(0.0, further) * harder
 
     def mixed(self, wanted: Array) -> Array:
         """Return wanted corrections (…, M) [Pa] as far as they have come back after a touch.
@@ -132,6 +142,6 @@ class Reaction:
         While one is suspected they are between none and what was sent last.
         """
         back: Array = self._kept + self._free * (wanted - self._kept)
-        if self._suspected and self._held is None:
+        if self._suspected and self._bound is None:
             back = np.clip(back, np.minimum(self._newest, 0.0), np.maximum(self._newest, 0.0))
         return back
