@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -26,11 +26,8 @@ from der_planner.limb.declaration import (
     check,
     commented,
     declarations,
-    field_names,
-    from_mapping,
-    number,
     parameter,
-    refuse_unknown,
+    read,
 )
 from der_planner.limb.loads import (
     BEYOND_THE_TIP,
@@ -308,35 +305,16 @@ class Limb:
         """
         if not isinstance(content, Mapping):
             raise LimbError(f"expected a mapping of keys, got {type(content).__name__}")
-        version = content.get("schema_version")
+        body = {"name": "limb", **content}
+        version = body.pop("schema_version", None)
         if version != SCHEMA_VERSION:
             raise LimbError(f"schema_version is {version!r}: this program reads {SCHEMA_VERSION}")
-        refuse_unknown(content, {"schema_version", *field_names(cls)}, "")
-        calibrated = content.get("calibrated") or {}
-        refuse_unknown(calibrated, field_names(CalibratedRange), "calibrated.")
-        return cls(
-            name=str(content.get("name", "limb")),
-            segments=_entries(Segment, content.get("segments"), "segments"),
-            pcc_segments=_entries(Segment, content.get("pcc_segments") or [], "pcc_segments"),
-            pneumatics=from_mapping(Pneumatics, content.get("pneumatics"), "pneumatics", _RETIRED),
-            connector_length=number(content.get("connector_length", 0.0), "connector_length"),
-            base_length=number(content.get("base_length", 0.0), "base_length"),
-            gravity=_numbers(content.get("gravity", (0.0, 0.0, 0.0)), "gravity"),
-            masses=_entries(PointMass, content.get("masses") or [], "masses"),
-            calibrated=CalibratedRange(
-                **{key: _numbers(value, f"calibrated.{key}") for key, value in calibrated.items()}
-            ),
-            provenance=dict(content.get("provenance") or {}),
-        )
+        limb: Limb = read(cls, body)
+        return limb
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the content of a limb file, which `from_mapping` makes an equal limb of."""
-        body: dict[str, Any] = {"schema_version": SCHEMA_VERSION, **dataclasses.asdict(self)}
-        for key in ("gravity", "segments", "pcc_segments", "masses"):
-            body[key] = list(body[key])
-        body["calibrated"] = {key: list(value) for key, value in body["calibrated"].items()}
-        body["provenance"] = dict(self.provenance)
-        return body
+        return {"schema_version": SCHEMA_VERSION, **dataclasses.asdict(self)}
 
     def to_yaml(self, path: str | Path) -> None:
         """Write a limb file that `from_yaml` reads back as an equal limb, whole or not at all."""
@@ -355,20 +333,3 @@ def sections() -> dict[str, dict[str, Parameter]]:
         "calibrated": declarations(CalibratedRange),
         "masses": declarations(PointMass),
     }
-
-
-_RETIRED = ("fill_rate", "minimum_supply")
-"""Keys of `pneumatics` in older limb files that nothing reads any more."""
-
-
-def _entries(kind: Any, content: object, key: str) -> tuple[Any, ...]:
-    """Return the dataclasses of a list of mappings in a limb file."""
-    if not isinstance(content, Sequence) or isinstance(content, str):
-        raise LimbError(f"{key} must be a list of mappings, one an entry, got {content!r}")
-    return tuple(from_mapping(kind, item, f"{key}[{index}]") for index, item in enumerate(content))
-
-
-def _numbers(value: object, key: str) -> tuple[Any, ...]:
-    if not isinstance(value, Sequence) or isinstance(value, str):
-        raise LimbError(f"{key} must be a list of numbers, got {value!r}")
-    return tuple(number(item, f"{key}[{index}]") for index, item in enumerate(value))

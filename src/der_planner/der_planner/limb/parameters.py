@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 from der_planner.limb.declaration import Term, parameter
 
@@ -214,6 +215,9 @@ class Segment:
 @dataclass(frozen=True)
 class Pneumatics:
     """How a commanded differential pressure becomes a measured one, and what may be asked for."""
+
+    RETIRED: ClassVar = ("fill_rate", "minimum_supply")
+    """Keys in older limb files that nothing reads any more."""
 
     pressure_limit: float = parameter(
         "Pa",
