@@ -41,10 +41,10 @@ from der_planner.experiment.console import (
     check_file,
     check_folder,
     check_limb_file,
+    command,
     command_parser,
     given_load,
     interrupt_once,
-    run_command,
 )
 from der_planner.experiment.processes import GraphError, Hardware, NodeError
 from der_planner.files import write_whole
@@ -79,17 +79,10 @@ LAST_PART = 0.25
 """Share of a LOG that is kept back to judge the fit."""
 
 
+@command(LogError, LimbError, GraphError, NodeError, OSError, stopped="no limb file was written")
 def main() -> int:
     """Run the command line: 0 when a limb file was written, 1 after an error, 2 for bad options."""
     given = _parser().parse_args()
-    return run_command(
-        lambda: _main(given),
-        *(LogError, LimbError, GraphError, NodeError, OSError),
-        stopped="no limb file was written",
-    )
-
-
-def _main(given: argparse.Namespace) -> int:
     _check(given)
     load = given_load(given)
     bare = Limb.from_yaml(given.prior) if given.prior else Limb.default()

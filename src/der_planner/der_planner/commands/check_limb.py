@@ -24,22 +24,19 @@ from der_planner.experiment.console import (
     OptionError,
     add_load_options,
     check_limb_file,
+    command,
     command_parser,
     given_load,
     loaded,
-    run_command,
 )
 from der_planner.identification import CalibrationLog, LogError, check, read_log, update
 from der_planner.limb import Limb, LimbError
 
 
+@command(LogError, LimbError, OSError)
 def main() -> int:
     """Run the command line."""
     given = _parser().parse_intermixed_args()
-    return run_command(lambda: _main(given), LogError, LimbError, OSError)
-
-
-def _main(given: argparse.Namespace) -> int:
     if given.out is not None:
         if not given.update:
             raise OptionError("--out is the updated limb file: give --update, too")

@@ -33,9 +33,9 @@ from der_planner.experiment.console import (
     Progress,
     check_file,
     check_folder,
+    command,
     command_parser,
     interrupt_once,
-    run_command,
 )
 from der_planner.experiment.processes import GraphError, Hardware, NodeError
 from der_planner.files import write_whole
@@ -53,13 +53,8 @@ CLAMP_OFF = (0.002, 0.002, float(np.deg2rad(1.5)))
 """What the clamp may be beside the origin of `limb_base` [m, m, rad]."""
 SEEN_TOGETHER = 10
 """Messages of each kind that a bag must hold."""
-
-
-def main() -> int:
-    """Run the command line."""
-    given = _parser().parse_args()
-    errors = (RigError, SettingError, BagError, MapError, TwinError, GraphError, NodeError)
-    return run_command(lambda: _main(given), *errors, OSError, stopped="no rig file was written")
+FAILURES = (RigError, SettingError, BagError, MapError, TwinError, GraphError, NodeError, OSError)
+"""What may end a check early."""
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -84,7 +79,10 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _main(given: argparse.Namespace) -> int:
+@command(*FAILURES, stopped="no rig file was written")
+def main() -> int:
+    """Run the command line."""
+    given = _parser().parse_args()
     if given.hardware and (given.wiring or given.poses):
         raise OptionError("--wiring and --poses are about the twin: leave --hardware out")
     content: dict[str, Any] = {"driver": {"protocol": given.board}, "twin": {}}

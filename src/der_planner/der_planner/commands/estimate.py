@@ -11,7 +11,6 @@ error of its gain, each with its standard deviation. Exit code 0: written; 2: a 
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 
 import numpy as np
@@ -19,10 +18,11 @@ import numpy as np
 from der_planner.arrays import Array
 from der_planner.commands.learn import FAILURES, add_plan_options, in_hindsight, plan_of
 from der_planner.control.hindsight import Smoothed, smooth
-from der_planner.experiment.console import check_file, command_parser, run_command
+from der_planner.experiment.console import check_file, command, command_parser
 from der_planner.results import RunSeries, load_run
 
 
+@command(*FAILURES, code=2)
 def main() -> int:
     """Run the command line."""
     parser = command_parser(__doc__)
@@ -31,10 +31,6 @@ def main() -> int:
     add_plan_options(parser)
     parser.add_argument("--namespace", default="", help="of the limb, where a bag holds several")
     given = parser.parse_args()
-    return run_command(lambda: _estimate(given), *FAILURES, code=2)
-
-
-def _estimate(given: argparse.Namespace) -> int:
     if given.out is not None:
         check_file(given.out)
     run = load_run(given.bag, namespace=given.namespace)

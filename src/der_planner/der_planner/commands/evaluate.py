@@ -22,8 +22,8 @@ from der_planner.experiment.console import (
     Progress,
     check_file,
     check_folder,
+    command,
     command_parser,
-    run_command,
 )
 from der_planner.results import (
     RunSeries,
@@ -77,13 +77,10 @@ def expand(paths: list[Path]) -> list[Path]:
     return found
 
 
+@command(*FAILURES, OSError)
 def main() -> int:
     """Run the command line; 0 when every bag was evaluated, 1 otherwise."""
     given = _arguments()
-    return run_command(lambda: _evaluate(given), *FAILURES, OSError)
-
-
-def _evaluate(given: argparse.Namespace) -> int:
     for name in ("report", "results"):
         if getattr(given, name) is not None:
             check_folder(getattr(given, name), f"--{name}")

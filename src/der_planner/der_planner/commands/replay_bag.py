@@ -30,9 +30,9 @@ from der_planner.experiment.client import GraphClient
 from der_planner.experiment.console import (
     OptionError,
     Progress,
+    command,
     command_parser,
     interrupt_once,
-    run_command,
 )
 from der_planner.experiment.processes import GraphError
 from limb_interfaces import qos
@@ -46,13 +46,6 @@ PATIENCE = 3.0
 """Longest wait for one answer [s]; then the message is sent again."""
 SETTLE = 0.3
 """Time [s] for a receiver's callback after the first message of a topic that nothing answers."""
-
-
-def main() -> int:
-    """Run the command line."""
-    given = _arguments()
-    interrupt_once()
-    return run_command(lambda: _replay(given), BagError, DefinitionError, GraphError)
 
 
 # What is played ---------------------------------------------------------------------------------
@@ -249,7 +242,11 @@ def _pairs(values: list[str], what: str) -> dict[str, str]:
     return dict(value.split("=") for value in values)
 
 
-def _replay(given: argparse.Namespace) -> int:
+@command(BagError, DefinitionError, GraphError)
+def main() -> int:
+    """Run the command line."""
+    given = _arguments()
+    interrupt_once()
     if given.rate < 0:
         raise OptionError(f"--rate is {given.rate}: choose 0 or more")
     wanted = Selection(given.start, given.stop, given.topics, _pairs(given.remap, "--remap"))

@@ -28,9 +28,9 @@ from der_planner.experiment.console import (
     OptionError,
     Progress,
     check_folder,
+    command,
     interrupt_once,
     loaded,
-    run_command,
 )
 from der_planner.experiment.offline_run import load_arrays, play_offline
 from der_planner.experiment.options import Options, Trial, TrialRun, parse
@@ -65,12 +65,9 @@ FAILURES = (GraphError, NodeError, PlanningError, LearningError, LogError, OSErr
 """What may end an experiment before its last trial."""
 
 
+@command(*FAILURES, stopped="the same --out goes on from here")
 def main() -> int:
     """Run the command line; 0 when every trial was played, 1 after an error, 2 for bad options."""
-    return run_command(_main, *FAILURES, stopped="the same --out goes on from here")
-
-
-def _main() -> int:
     options = parse(sys.argv[1:])
     if not options.offline:
         interrupt_once()

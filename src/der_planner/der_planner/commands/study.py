@@ -17,9 +17,9 @@ from pathlib import Path
 from der_planner.experiment.console import (
     OptionError,
     Progress,
+    command,
     command_parser,
     interrupt_once,
-    run_command,
 )
 from der_planner.studies.conduct import PlaySettings, Store, conduct
 from der_planner.studies.factors import ERROR, PLANNED, StudyError, limb_parameters, of_task
@@ -59,6 +59,10 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+@command(
+    StudyError,
+    stopped="what was done is kept, and the same command with the same --out goes on from here",
+)
 def main() -> int:
     """Run the command line.
 
@@ -70,14 +74,6 @@ def main() -> int:
     if given.list:
         print(_listing())
         return 0
-    return run_command(
-        lambda: _play(given),
-        StudyError,
-        stopped="what was done is kept, and the same command with the same --out goes on from here",
-    )
-
-
-def _play(given: argparse.Namespace) -> int:
     if given.study is None:
         raise OptionError("name a study: a file, or one of those that --list shows")
     for name in ("workers", "limit"):
