@@ -71,7 +71,7 @@ from der_planner.identification.readers import ask_map, read_table
 from der_planner.identification.report import plot_prediction
 from der_planner.identification.stiffness import FREE, REST
 from der_planner.identification.terms import GROUPS
-from der_planner.limb import Limb, LimbError, Load
+from der_planner.limb import Limb, LimbError
 from der_planner.model import CONTROL_PERIOD
 from der_planner.planning.loads import nearly_buckling
 
@@ -116,7 +116,8 @@ def main() -> int:
         provenance = {**limb.provenance, "weighed_kg": given.mass}
         limb = dataclasses.replace(limb, provenance=provenance)
     unseen = [*kept_back, *held_out]
-    kept = _unloaded(limb, load)
+    # The payload, which was put on last, belongs to the log alone.
+    kept = dataclasses.replace(limb, masses=limb.masses[:-1]) if load.payload else limb
     lines = [report.text(), *(_held_out_text(limb, each, given.longest_gap) for each in unseen)]
     text = "\n".join([*lines, _weight(kept, given)])
     print(text)
@@ -261,11 +262,6 @@ def _check(given: argparse.Namespace) -> None:
     check_limb_file(given.out)
     if given.report:
         check_folder(given.report, "--report")
-
-
-def _unloaded(limb: Limb, load: Load) -> Limb:
-    """Return a limb without the payload of a load, which was put on last."""
-    return dataclasses.replace(limb, masses=limb.masses[:-1]) if load.payload else limb
 
 
 def _weight(limb: Limb, given: argparse.Namespace) -> str:
