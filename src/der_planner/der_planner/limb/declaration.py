@@ -10,6 +10,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
+from functools import partial
 from typing import Any, get_args, get_origin, get_type_hints
 
 _KEY = "parameter"
@@ -132,6 +133,14 @@ def parameter(
     ends = interval.startswith("["), interval.endswith("]")
     declared = Parameter(unit, text, choose, low, high, *ends, needs=needs, fit=fit)
     return field(default=default, metadata={_KEY: declared})
+
+
+positive = partial(parameter, interval="(0, inf)")
+"""A parameter that every limb has."""
+effect = partial(parameter, default=0.0, interval="[0, inf)")
+"""A parameter of something that a limb may show or have; 0: it does not."""
+signed_effect = partial(parameter, default=0.0)
+"""The same where it has a direction."""
 
 
 def declarations(kind: Any) -> dict[str, Parameter]:

@@ -26,6 +26,7 @@ from der_planner.limb.declaration import (
     check,
     commented,
     declarations,
+    effect,
     parameter,
     read,
 )
@@ -63,12 +64,10 @@ class Limb:
     name: str
     segments: tuple[Segment, ...]
     pneumatics: Pneumatics
-    connector_length: float = parameter(
+    connector_length: float = effect(
         "m",
         "straight passive piece between two segments",
         "measure it; 0 lets the rod's mesh choose one edge that belongs to neither segment",
-        default=0.0,
-        interval="[0, inf)",
     )
     gravity: tuple[float, float, float] = parameter(
         "m/s²",
@@ -81,12 +80,10 @@ class Limb:
     calibrated: CalibratedRange = field(default_factory=CalibratedRange)
     provenance: Mapping[str, Any] = field(default_factory=dict)
     pcc_segments: tuple[Segment, ...] = ()
-    base_length: float = parameter(
+    base_length: float = effect(
         "m",
         "straight passive piece between the clamp and the first segment",
         "measure it; the calibration corrects it by the tip",
-        default=0.0,
-        interval="[0, inf)",
     )
     masses: tuple[PointMass, ...] = ()
 
