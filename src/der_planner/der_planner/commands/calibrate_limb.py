@@ -36,7 +36,6 @@ import numpy as np
 
 from der_planner.experiment.console import (
     OptionError,
-    Progress,
     add_load_options,
     check_file,
     check_folder,
@@ -44,7 +43,6 @@ from der_planner.experiment.console import (
     command,
     command_parser,
     given_load,
-    interrupt_once,
 )
 from der_planner.experiment.processes import GraphError, Hardware, NodeError
 from der_planner.files import write_whole
@@ -330,14 +328,13 @@ def _play_on_graph(prior: Limb, given: argparse.Namespace) -> Path:
     # ROS is imported only by who needs it.
     from der_planner.experiment.graph_trials import play_calibration  # noqa: PLC0415
 
-    interrupt_once()
     hardware = Hardware.from_yaml(given.hardware) if given.hardware else None
     driver = (hardware or Hardware()).limits
     limit = min(prior.pneumatics.pressure_limit, driver.pressure_limit)
     # Steps may be faster than the limb's own slew_limit, which is for plans: they show how the air
     # follows. The driver's limit holds for every setpoint.
     run = within_limits(_excitation(prior, limit, given), limit, driver.slew_limit)
-    return play_calibration(run, given.folder, Progress(), prior, given.seed, hardware)
+    return play_calibration(run, given.folder, prior, given.seed, hardware)
 
 
 def _held_out_text(limb: Limb, log: CalibrationLog, longest_gap: float) -> str:

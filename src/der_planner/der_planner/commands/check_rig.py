@@ -30,12 +30,10 @@ from der_planner.bags.reader import BagError, BagReader
 from der_planner.bags.record import PRESSURE_TYPE, Columns, header_stamp
 from der_planner.experiment.console import (
     OptionError,
-    Progress,
     check_file,
     check_folder,
     command,
     command_parser,
-    interrupt_once,
 )
 from der_planner.experiment.processes import GraphError, Hardware, NodeError
 from der_planner.files import write_whole
@@ -174,13 +172,12 @@ def _play(given: argparse.Namespace, hardware: Hardware) -> Path:
     # ROS is imported only by who needs it.
     from der_planner.experiment.graph_trials import play_calibration  # noqa: PLC0415
 
-    interrupt_once()
     folder = given.folder or Path("checks") / time.strftime("%Y-%m-%d_%H-%M-%S")
     check_folder(folder, "--folder")
     driver = hardware.limits
     run = check_run(driver.segment_count, given.pressure or GENTLE * driver.pressure_limit)
     run = within_limits(run, np.inf, driver.slew_limit)  # the driver refuses what is beyond its own
-    return play_calibration(run, folder.resolve(), Progress(), Limb.default(), given.seed, hardware)
+    return play_calibration(run, folder.resolve(), Limb.default(), given.seed, hardware)
 
 
 def _map_path(hardware: Hardware) -> Path:
