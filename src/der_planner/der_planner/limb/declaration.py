@@ -165,13 +165,17 @@ def check(item: Any, where: str = "") -> None:
             )
 
 
-def commented(text: str, sections: Mapping[str, Mapping[str, Parameter]]) -> str:
+def commented(text: str, kind: Any) -> str:
     """Return YAML text in block style with unit and meaning behind each declared key.
 
     Args:
-        text: one mapping, whose values are numbers, lists or mappings of declared keys.
-        sections: declared parameters by the top-level key that holds them; "" for the top level.
+        text: one mapping, as `read` makes the dataclass of it.
+        kind: the dataclass; its fields may be others, or tuples of them.
     """
+    sections = {"": declarations(kind)}
+    for key, held in get_type_hints(kind).items():
+        for each in filter(is_dataclass, (held, *get_args(held))):
+            sections[key] = declarations(each)
     section, lines = "", list[str]()
     for line in text.splitlines():
         match = re.match(r"([- ]*)(\w+):", line)

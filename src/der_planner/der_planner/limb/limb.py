@@ -22,10 +22,8 @@ from numpy.typing import NDArray
 from der_planner.files import read_yaml, write_whole, yaml_text
 from der_planner.limb.declaration import (
     LimbError,
-    Parameter,
     check,
     commented,
-    declarations,
     effect,
     parameter,
     read,
@@ -317,16 +315,4 @@ class Limb:
         """Write a limb file that `from_yaml` reads back as an equal limb, whole or not at all."""
         text = yaml_text(self.to_mapping(), allow_unicode=True)
         head = "# A limb, in SI units. How to choose each: the site, python3 scripts/docs.py\n"
-        write_whole(path, head + commented(text, sections()))
-
-
-def sections() -> dict[str, dict[str, Parameter]]:
-    """Return the declared parameters by the key of a limb file that holds them; "": itself."""
-    return {
-        "": declarations(Limb),
-        "segments": declarations(Segment),
-        "pcc_segments": declarations(Segment),
-        "pneumatics": declarations(Pneumatics),
-        "calibrated": declarations(CalibratedRange),
-        "masses": declarations(PointMass),
-    }
+        write_whole(path, head + commented(text, Limb))
