@@ -14,13 +14,7 @@ from distributed import LocalCluster
 
 from der_planner.experiment.console import Progress
 from der_planner.studies import conduct as conducting
-from der_planner.studies.conduct import (
-    Outcome,
-    PlaySettings,
-    Store,
-    compute,
-    conduct,
-)
+from der_planner.studies.conduct import Outcome, PlaySettings, Store, compute, conduct
 from der_planner.studies.factors import StudyError
 from der_planner.studies.report import summarise
 from der_planner.studies.study import Study

@@ -20,22 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from der_planner.files import read_yaml, write_whole, yaml_text
-from der_planner.limb.declaration import (
-    LimbError,
-    check,
-    commented,
-    effect,
-    parameter,
-    read,
-)
-from der_planner.limb.loads import (
-    BEYOND_THE_TIP,
-    PAYLOAD,
-    Load,
-    PointMass,
-    gravity_of,
-    mounting_of,
-)
+from der_planner.limb.declaration import LimbError, check, commented, effect, parameter, read
+from der_planner.limb.loads import BEYOND_THE_TIP, PAYLOAD, Load, PointMass, gravity_of, mounting_of
 from der_planner.limb.parameters import CalibratedRange, Pneumatics, Segment
 
 SCHEMA_VERSION = 1
