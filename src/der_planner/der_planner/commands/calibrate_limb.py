@@ -41,7 +41,6 @@ from der_planner.experiment.console import (
     check_folder,
     check_limb_file,
     command,
-    command_parser,
     given_load,
 )
 from der_planner.experiment.processes import GraphError, Hardware, NodeError
@@ -78,9 +77,9 @@ LAST_PART = 0.25
 
 
 @command(LogError, LimbError, GraphError, NodeError, OSError, stopped="no limb file was written")
-def main() -> int:
+def main(parser: argparse.ArgumentParser) -> int:
     """Run the command line: 0 when a limb file was written, 1 after an error, 2 for bad options."""
-    given = _parser().parse_args()
+    given = _options(parser)
     _check(given)
     load = given_load(given)
     bare = Limb.from_yaml(given.prior) if given.prior else Limb.default()
@@ -128,8 +127,7 @@ def main() -> int:
     return 0
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = command_parser(__doc__)
+def _options(parser: argparse.ArgumentParser) -> argparse.Namespace:
     source = parser.add_mutually_exclusive_group(required=True)
     source.add_argument("--offline", action="store_true", help="calibrate the twin of --seed")
     source.add_argument(
@@ -205,7 +203,7 @@ def _parser() -> argparse.ArgumentParser:
         help="limb file to write (default: limb.yaml)",
     )
     parser.add_argument("--report", type=Path, help="folder for report.txt and prediction.png")
-    return parser
+    return parser.parse_args()
 
 
 def _terms(text: str) -> list[str]:

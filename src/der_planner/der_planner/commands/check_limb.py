@@ -25,7 +25,6 @@ from der_planner.experiment.console import (
     add_load_options,
     check_limb_file,
     command,
-    command_parser,
     given_load,
     loaded,
 )
@@ -34,9 +33,9 @@ from der_planner.limb import Limb, LimbError
 
 
 @command(LogError, LimbError, OSError)
-def main() -> int:
+def main(parser: argparse.ArgumentParser) -> int:
     """Run the command line."""
-    given = _parser().parse_intermixed_args()
+    given = _options(parser)
     if given.out is not None:
         if not given.update:
             raise OptionError("--out is the updated limb file: give --update, too")
@@ -51,8 +50,7 @@ def main() -> int:
     return max([_check(under_load, log, len(logs) > 1) for log in logs])
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = command_parser(__doc__)
+def _options(parser: argparse.ArgumentParser) -> argparse.Namespace:
     parser.add_argument(
         "runs", nargs="+", type=Path, metavar="BAG", help="bags of runs, or CSV tables"
     )
@@ -64,7 +62,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--out", type=Path, metavar="FILE", help="updated limb file, a new one")
     add_load_options(parser)
-    return parser
+    return parser.parse_intermixed_args()
 
 
 def _check(limb: Limb, log: CalibrationLog, named: bool) -> int:

@@ -28,13 +28,7 @@ from apriltag_tracker.pose.clamp import Clamp, at_clamp, find_clamp
 from apriltag_tracker.tag_map import MapError, TagMap
 from der_planner.bags.reader import BagError, BagReader
 from der_planner.bags.record import PRESSURE_TYPE, Columns, header_stamp
-from der_planner.experiment.console import (
-    OptionError,
-    check_file,
-    check_folder,
-    command,
-    command_parser,
-)
+from der_planner.experiment.console import OptionError, check_file, check_folder, command
 from der_planner.experiment.processes import GraphError, Hardware, NodeError
 from der_planner.files import write_whole
 from der_planner.identification.excitation import within_limits
@@ -55,8 +49,7 @@ FAILURES = (RigError, SettingError, BagError, MapError, TwinError, GraphError, N
 """What may end a check early."""
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = command_parser(__doc__)
+def _options(parser: argparse.ArgumentParser) -> argparse.Namespace:
     parser.add_argument("--hardware", type=Path, metavar="FILE", help="rig file to begin with")
     parser.add_argument("--bag", type=Path, help="judge a check that was recorded before")
     parser.add_argument(
@@ -74,13 +67,13 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--poses", action="store_true", help="of the twin: motion capture, no tags")
     parser.add_argument("--folder", type=Path, help="for bag and logs (default: checks/ and time)")
     parser.add_argument("--out", type=Path, metavar="FILE", help="rig file to write")
-    return parser
+    return parser.parse_args()
 
 
 @command(*FAILURES, stopped="no rig file was written")
-def main() -> int:
+def main(parser: argparse.ArgumentParser) -> int:
     """Run the command line."""
-    given = _parser().parse_args()
+    given = _options(parser)
     if given.hardware and (given.wiring or given.poses):
         raise OptionError("--wiring and --poses are about the twin: leave --hardware out")
     content: dict[str, Any] = {"driver": {"protocol": given.board}, "twin": {}}

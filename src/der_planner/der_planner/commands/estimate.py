@@ -11,6 +11,7 @@ error of its gain, each with its standard deviation. Exit code 0: written; 2: a 
 
 from __future__ import annotations
 
+import argparse
 from pathlib import Path
 
 import numpy as np
@@ -18,14 +19,13 @@ import numpy as np
 from der_planner.arrays import Array
 from der_planner.commands.learn import FAILURES, add_plan_options, in_hindsight, plan_of
 from der_planner.control.hindsight import Smoothed, smooth
-from der_planner.experiment.console import check_file, command, command_parser
+from der_planner.experiment.console import check_file, command
 from der_planner.results import RunSeries, load_run
 
 
 @command(*FAILURES, code=2)
-def main() -> int:
+def main(parser: argparse.ArgumentParser) -> int:
     """Run the command line."""
-    parser = command_parser(__doc__)
     parser.add_argument("bag", type=Path, metavar="BAG", help="of a run")
     parser.add_argument("--out", type=Path, metavar="FILE", help="table (CSV) to write")
     add_plan_options(parser)

@@ -21,7 +21,7 @@ import numpy as np
 
 from der_planner.control import Learner, LearningError
 from der_planner.control.hindsight import Filmed, touches
-from der_planner.experiment.console import check_file, command, command_parser
+from der_planner.experiment.console import check_file, command
 from der_planner.limb import Limb, LimbError, Load
 from der_planner.planning import Motion, Obstacles, Plan, PlanningError, plan
 from der_planner.planning.motions import NAMES
@@ -37,9 +37,8 @@ _SAME_POINT = 2e-3
 
 
 @command(*FAILURES, code=2)
-def main() -> int:
+def main(parser: argparse.ArgumentParser) -> int:
     """Run the command line."""
-    parser = command_parser(__doc__)
     parser.add_argument("bags", nargs="+", type=Path, metavar="BAG", help="bags, oldest first")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the next plan")
     add_plan_options(parser)

@@ -27,13 +27,7 @@ from der_planner.bags.reader import BagError, BagReader, RawMessage, RecordedTop
 from der_planner.bags.record import NANOSECONDS
 from der_planner.bags.topics import DefinitionError, message_class
 from der_planner.experiment.client import GraphClient
-from der_planner.experiment.console import (
-    OptionError,
-    Progress,
-    command,
-    command_parser,
-    interrupt_once,
-)
+from der_planner.experiment.console import OptionError, Progress, command, interrupt_once
 from der_planner.experiment.processes import GraphError
 from limb_interfaces import qos
 
@@ -220,8 +214,7 @@ class GraphOutput:
         self._clock.publish(message)
 
 
-def _arguments() -> argparse.Namespace:
-    parser = command_parser(__doc__)
+def _options(parser: argparse.ArgumentParser) -> argparse.Namespace:
     parser.add_argument("bag", type=Path, metavar="BAG", help="folder, .mcap or .db3 file")
     parser.add_argument("--rate", type=float, default=1.0, help="0: as fast as possible")
     parser.add_argument("--from", dest="start", type=float, default=0.0, metavar="S")
@@ -243,9 +236,9 @@ def _pairs(values: list[str], what: str) -> dict[str, str]:
 
 
 @command(BagError, DefinitionError, GraphError)
-def main() -> int:
+def main(parser: argparse.ArgumentParser) -> int:
     """Run the command line."""
-    given = _arguments()
+    given = _options(parser)
     interrupt_once()
     if given.rate < 0:
         raise OptionError(f"--rate is {given.rate}: choose 0 or more")

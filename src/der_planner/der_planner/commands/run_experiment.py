@@ -1,6 +1,6 @@
 """Play motions on the limb or its twin and report the tracking error: the main command.
 
-    python3 scripts/run_experiment.py
+    python3 scripts/run_experiment.py        (Case 2, same_direction, DER and PCC, one trial each)
     python3 scripts/run_experiment.py --motions all --method optimal --trials 5
     python3 scripts/run_experiment.py --offline --motions all --trials 5
     python3 scripts/run_experiment.py --hardware my_rig.yaml --limb my_limb.yaml
@@ -12,6 +12,7 @@ Everything else is one path.
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import hashlib
 import json
@@ -66,9 +67,9 @@ FAILURES = (GraphError, NodeError, PlanningError, LearningError, LogError, OSErr
 
 
 @command(*FAILURES, stopped="the same --out goes on from here")
-def main() -> int:
+def main(parser: argparse.ArgumentParser) -> int:
     """Run the command line; 0 when every trial was played, 1 after an error, 2 for bad options."""
-    options = parse(sys.argv[1:])
+    options = parse(sys.argv[1:], parser)
     if not options.offline:
         interrupt_once()
     if options.page is None or options.dry_run:

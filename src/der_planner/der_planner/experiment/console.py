@@ -94,20 +94,14 @@ def interrupt_once() -> None:
     on_end_signals(interrupt)
 
 
-def command_parser(text: str | None) -> argparse.ArgumentParser:
-    """Return the parser of a command whose module's text is shown by --help as it stands."""
-    return argparse.ArgumentParser(
-        description=text, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-
-
 def command(
     *failures: type[Exception], stopped: str = "", code: int = 1
-) -> Callable[[Callable[[], int]], Callable[[], int]]:
+) -> Callable[[Callable[[argparse.ArgumentParser], int]], Callable[[], int]]:
     """Return a decorator for the main function of a command: why it ended early is said on stderr.
 
-    The exit code is then 2 for options that cannot be, and for results that cannot be written where
-    they are wanted; 130 after a signal.
+    The function gets a parser whose --help shows the text of its module as it stands. Its exit code
+    is 2 for options that cannot be, and for results that cannot be written where they are wanted;
+    130 after a signal.
 
     Args:
         failures: what may go wrong besides the options and the places of results.
@@ -115,11 +109,15 @@ def command(
         code: of a failure.
     """
 
-    def decorate(work: Callable[[], int]) -> Callable[[], int]:
+    def decorate(work: Callable[[argparse.ArgumentParser], int]) -> Callable[[], int]:
         @functools.wraps(work)
         def main() -> int:
+            parser = argparse.ArgumentParser(
+                description=sys.modules[work.__module__].__doc__,
+                formatter_class=argparse.RawDescriptionHelpFormatter,
+            )
             try:
-                return work()
+                return work(parser)
             except OptionError as error:
                 ended, said = 2, f"error: {error}"
             except failures as error:

@@ -273,16 +273,10 @@ class TrialRun(NamedTuple):
         return plan(self.limb, motion, trial.model, trial.method, obstacles=self.options.in_the_way)
 
 
-def parser() -> argparse.ArgumentParser:
-    """Return the parser of the command line."""
-    result = argparse.ArgumentParser(
-        prog="run_experiment.py",
-        description="Play motions on the limb (or its twin) and report the tracking error.",
-        epilog="Without options: Case 2 (same_direction), DER and PCC, one trial each, on the twin",
-    )
+def _add_options(parser: argparse.ArgumentParser) -> None:
     for each in dataclasses.fields(Options):
         if each.name == "load":
-            add_load_options(result)
+            add_load_options(parser)
             continue
         told = {key: value for key, value in each.metadata.items() if key != "within"}
         flag = told.pop("flag", f"--{each.name.replace('_', '-')}")
@@ -293,18 +287,23 @@ def parser() -> argparse.ArgumentParser:
             told["help"] += f" (default: {' '.join(map(str, shown))})"
         if isinstance(each.default, (int, float)) and "action" not in told:
             told["type"] = type(each.default)
-        result.add_argument(flag, dest=each.name, default=each.default, **told)
-    return result
+        parser.add_argument(flag, dest=each.name, default=each.default, **told)
 
 
-def parse(arguments: Sequence[str]) -> Options:
+def parse(arguments: Sequence[str], parser: argparse.ArgumentParser | None = None) -> Options:
     """Parse and check a command line.
+
+    Args:
+        arguments: of the command line.
+        parser: gets the options; None: one without a text for --help.
 
     Raises:
         OptionError: a number out of range, an unreadable file, or options that do not go together.
         SystemExit: after --help, or when argparse itself refuses, as an unknown name.
     """
-    given = parser().parse_args(arguments)
+    parser = parser or argparse.ArgumentParser()
+    _add_options(parser)
+    given = parser.parse_args(arguments)
     values: dict[str, Any] = {}
     for each in dataclasses.fields(Options):
         value = values[each.name] = getattr(given, each.name, None)
