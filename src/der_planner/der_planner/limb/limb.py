@@ -172,15 +172,23 @@ class Limb:
                 f"{mass:g} kg are {factor:.4g} times what the limb file says, {self.mass:.3g} kg: "
                 "give kg"
             )
+        return self.scaled("mass_per_length", factor)
 
-        def scaled(segments: tuple[Segment, ...]) -> tuple[Segment, ...]:
-            return tuple(
-                dataclasses.replace(s, mass_per_length=factor * s.mass_per_length) for s in segments
+    def scaled(self, name: str, factor: float, segment: int | None = None) -> Limb:
+        """Return the limb with a parameter of one segment, or of all, times a factor.
+
+        Both models get it, where the calibration gave the arcs numbers of their own.
+        """
+        changed: dict[str, Any] = {
+            key: tuple(
+                dataclasses.replace(each, **{name: factor * getattr(each, name)})
+                if segment in (None, place)
+                else each
+                for place, each in enumerate(getattr(self, key))
             )
-
-        return dataclasses.replace(
-            self, segments=scaled(self.segments), pcc_segments=scaled(self.pcc_segments)
-        )
+            for key in ("segments", "pcc_segments")
+        }
+        return dataclasses.replace(self, **changed)
 
     def carrying(self, payload: float, at: float | None = None, name: str = PAYLOAD) -> Limb:
         """Return the limb with one more mass.
