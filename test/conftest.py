@@ -73,7 +73,11 @@ def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) ->
 
     def called(command: Any, *arguments: object) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", [command.__name__, *map(str, arguments)])
-        return command.main(), *capsys.readouterr()
+        try:
+            code = command.main()
+        except SystemExit as ended:
+            code = ended.code
+        return code, *capsys.readouterr()
 
     return called
 

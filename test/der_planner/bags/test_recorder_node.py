@@ -1,116 +1,69 @@
-"""The recorder on a graph, in the process of the test; replays as people start them."""
+"""The recorder as a process of the graph, and replays as people start them."""
 
 import itertools
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
-import rclpy
-import yaml
 from bags import START, TEXT, read_texts, spec, string
-from domain import own_domain
 from rclpy.duration import Duration
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Image
 from std_msgs.msg import Header, String, UInt8MultiArray
-from std_srvs.srv import Trigger
 
 from der_planner.bags.reader import BagReader
 from der_planner.bags.writer import BagWriter
-from der_planner.nodes.recorder import Recorder
+from der_planner.experiment.processes import GraphError, NodeError
 from limb_interfaces import qos
-from limb_interfaces.parameters import ParameterError
 
 pytestmark = pytest.mark.graph
 SCRIPTS = Path(__file__).resolve().parents[3] / "scripts"
 
 
-class Bench:
-    """A recorder and a node that talks to it; both are served while something is waited for."""
-
-    def __init__(self, folder: Path, **parameters) -> None:
-        file = folder / "parameters.yaml"
-        content = {"/limb/recorder": {"ros__parameters": parameters}}
-        file.write_text(yaml.safe_dump(content))
-        line = ["--ros-args", "--params-file", str(file)]
-        rclpy.init(args=line, domain_id=own_domain(__file__))
-        self.executor = SingleThreadedExecutor()
-        self.node = Node("talker", namespace="limb", use_global_arguments=False)
-        self.executor.add_node(self.node)
-        self.recorder = Recorder()
-        self.executor.add_node(self.recorder)
-
-    def wait_for(self, condition) -> None:
-        deadline = self.node.get_clock().now() + Duration(seconds=60)
-        while not condition():
-            assert self.node.get_clock().now() < deadline
-            self.executor.spin_once(timeout_sec=0.05)
-
-    def call(self, name: str):
-        client = self.node.create_client(Trigger, f"recorder/{name}")
-        self.wait_for(client.service_is_ready)
-        future = client.call_async(Trigger.Request())
-        self.wait_for(future.done)
-        return future.result()
-
-    def talk(self, topic: str, profile=qos.STATES, kind=String):
-        """Return a publisher that the recorder has found."""
-        publisher = self.node.create_publisher(kind, topic, profile)
-        self.wait_for(publisher.get_subscription_count)
-        return publisher
-
-    def health(self):
-        return self.recorder._health()
-
-    def written(self) -> int:
-        return int(self.health().values.get("recorded", 0))
+def record(graph, **parameters):
+    """Start a recorder, and wait until it is ready."""
+    process = graph.start("der_planner", "recorder", output=str(graph.folder / "run"), **parameters)
+    graph.client.watch([process])
+    graph.client.wait_ready(["recorder"])
+    return process
 
 
-@pytest.fixture
-def bench(tmp_path: Path):
-    made = []
-
-    def make(**parameters) -> Bench:
-        made.append(Bench(tmp_path, output=str(tmp_path / "run"), **parameters))
-        return made[0]
-
-    yield make
-    for each in made:
-        each.recorder.close()
-        each.executor.shutdown()
-    rclpy.try_shutdown()
+def talk(graph, topic: str, profile=qos.STATES, kind=String):
+    """Return a publisher that the recorder has found."""
+    publisher = graph.client.node.create_publisher(kind, topic, profile)
+    graph.client.wait_for(publisher.get_subscription_count, 60.0, f"a subscriber of {topic}")
+    return publisher
 
 
-def test_records_the_graph_between_start_and_stop(bench, tmp_path: Path):
-    graph = bench(metadata='{"motion": "circle", "trial": 3}')
-    latched = graph.talk("latched", qos.LATCHED)
+def test_records_the_graph_between_start_and_stop(graph, tmp_path: Path):
+    record(graph, metadata='{"motion": "circle", "trial": 3}')
+    call, node = graph.client.call, graph.client.node
+    latched = talk(graph, "latched", qos.LATCHED)
     latched.publish(String(data="the plan"))
-    fast = graph.talk("fast", qos.SENSOR_DATA)
-    image = graph.node.create_publisher(Image, "camera/image_raw", qos.SENSOR_DATA)
-    graph.node.create_publisher(String, "moves/_action/feedback", 1)
+    fast = talk(graph, "fast", qos.SENSOR_DATA)
+    image = node.create_publisher(Image, "camera/image_raw", qos.SENSOR_DATA)
+    node.create_publisher(String, "moves/_action/feedback", 1)
     fast.publish(String(data="before the start"))
-    assert "not recording" in graph.call("stop").message
+    with pytest.raises(GraphError, match="not recording"):
+        call("recorder/stop")
 
-    assert graph.call("start").message == str(tmp_path / "run")
-    again = graph.call("start")
-    assert not again.success
-    assert "already recording" in again.message
+    assert call("recorder/start") == str(tmp_path / "run")
+    with pytest.raises(GraphError, match="already recording"):
+        call("recorder/start")
     for index in range(20):
         fast.publish(String(data=f"fast {index}"))
         image.publish(Image(data=b"123"))
-        graph.executor.spin_once(timeout_sec=0.0)
-    late = graph.talk("late")  # appears while recording
-    late.publish(String(data="late one"))
-    graph.wait_for(lambda: graph.written() >= 22)
-    late.publish(String(data="late two"))
+    late = talk(graph, "late")  # appears while recording
+    for word in ("late one", "late two"):
+        late.publish(String(data=word))
     assert late.wait_for_all_acked(Duration(seconds=30))
-    assert graph.call("stop").message == str(tmp_path / "run")
-    assert "not empty: name another" in graph.call("start").message
+    assert call("recorder/stop") == str(tmp_path / "run")
+    with pytest.raises(GraphError, match="not empty: name another"):
+        call("recorder/start")
 
     texts = read_texts(tmp_path / "run")
     assert texts[0] == "the plan"
@@ -126,49 +79,44 @@ def test_records_the_graph_between_start_and_stop(bench, tmp_path: Path):
         assert not bag.topics["/limb/fast"].reliable
 
 
-def test_the_end_of_the_node_closes_the_bag(bench, tmp_path: Path):
-    graph = bench(autostart=True, topics="/limb/talk")
-    talk = graph.talk("talk")
+def test_the_end_of_the_node_closes_the_bag(graph, tmp_path: Path):
+    process = record(graph, autostart=True, topics="/limb/talk")
+    publisher = talk(graph, "talk")
     for index in range(20):
-        talk.publish(String(data=f"word {index}"))
-    assert talk.wait_for_all_acked(Duration(seconds=30))
-    graph.recorder.close()
+        publisher.publish(String(data=f"word {index}"))
+    assert publisher.wait_for_all_acked(Duration(seconds=30))
+    assert process.stop() == 0
     assert read_texts(tmp_path / "run") == [f"word {index}" for index in range(20)]
 
 
-def test_what_a_stopped_recorder_missed_is_counted(bench, tmp_path: Path):
-    graph = bench(topics="/limb/data")
-    data = graph.talk("data", 10, UInt8MultiArray)
-    assert graph.call("start").success
-    sent = 0
-
-    def send(count: int) -> None:
-        nonlocal sent
-        for _ in range(count):
-            data.publish(UInt8MultiArray(data=bytes(1000)))
-            sent += 1
-
-    send(1)
-    graph.wait_for(lambda: graph.written() == 1)
-    send(400)  # meanwhile nobody serves the recorder
+def test_what_a_stopped_recorder_missed_is_counted(graph, tmp_path: Path):
+    process, told = record(graph, topics="/limb/data"), graph.client.diagnostic_values
+    data = talk(graph, "data", 10, UInt8MultiArray)
+    graph.client.call("recorder/start")
+    data.publish(UInt8MultiArray(data=bytes(1000)))
+    graph.client.wait_for(lambda: told("recorder").get("recorded") == "1", 60.0, "the first one")
+    process.signal(signal.SIGSTOP)
+    for _ in range(1000):
+        data.publish(UInt8MultiArray(data=bytes(1000)))
+    process.signal(signal.SIGCONT)
     assert data.wait_for_all_acked(Duration(seconds=30))
-    assert graph.call("stop").success
+    graph.client.call("recorder/stop")
     with BagReader(tmp_path / "run") as bag:
-        written = bag.topics["/limb/data"].message_count
-    missed = int(graph.health().values["missed"].removeprefix("/limb/data: "))
+        missed = 1001 - bag.topics["/limb/data"].message_count
     assert missed > 0
-    assert written + missed == sent
+    said = f"/limb/data: {missed}"
+    graph.client.wait_for(lambda: told("recorder")["missed"] == said, 30.0, said)
 
 
-def test_a_bag_that_cannot_be_written_is_reported_at_once(bench, tmp_path: Path):
-    graph = bench(autostart=True, topics="/limb/talk")
+def test_a_bag_that_cannot_be_written_is_reported_at_once(graph, tmp_path: Path):
+    record(graph, autostart=True, topics="/limb/talk")
     shutil.rmtree(tmp_path / "run")
-    graph.wait_for(lambda: graph.health().values["state"] == "failed")
-    assert "was removed" in graph.health().message
+    told = graph.client.diagnostic_values
+    graph.client.wait_for(lambda: told("recorder").get("state") == "failed", 60.0, "the failure")
+    assert "was removed" in graph.client.diagnostics["recorder"].message
     (tmp_path / "run").write_text("a file is in the way")
-    refused = graph.call("start")
-    assert not refused.success
-    assert "cannot write a bag into" in refused.message
+    with pytest.raises(GraphError, match="cannot write a bag into"):
+        graph.client.call("recorder/start")
 
 
 @pytest.mark.parametrize(
@@ -179,9 +127,9 @@ def test_a_bag_that_cannot_be_written_is_reported_at_once(bench, tmp_path: Path)
         ({"metadata": "{broken", "autostart": True}, "parameter 'metadata' is no JSON"),
     ],
 )
-def test_bad_parameters_are_refused_by_name(bench, parameters, message):
-    with pytest.raises(ParameterError, match=message):
-        bench(**parameters)
+def test_bad_parameters_are_refused_by_name(graph, parameters, message):
+    with pytest.raises(NodeError, match=message):
+        record(graph, **parameters)
 
 
 def test_replay_publishes_the_recorded_bytes_and_waits_for_answers(graph, tmp_path: Path):

@@ -38,20 +38,14 @@ def write_bag(folder, planned, shift):
     bag.bag.close()
 
 
-def call(monkeypatch, *arguments):
-    monkeypatch.setattr(sys, "argv", ["learn.py", *map(str, arguments)])
-    return learn.main()
-
-
-def test_two_bags_become_the_next_plan(planned, tmp_path, monkeypatch, capsys):
+def test_two_bags_become_the_next_plan(planned, tmp_path, call):
     Limb.default().to_yaml(tmp_path / "limb.yaml")
     for number in (1, 2):
         write_bag(tmp_path / f"bag{number}", planned, number * SHIFT / 1.5)
     out = tmp_path / "learned.yaml"
     bags = [tmp_path / "bag1", tmp_path / "bag2"]
-    assert call(monkeypatch, *bags, "--limb", tmp_path / "limb.yaml", "--out", out) == 0
-    said = capsys.readouterr().out
-    assert said.count("mean error") == 3
+    code, said, _ = call(learn, *bags, "--limb", tmp_path / "limb.yaml", "--out", out)
+    assert (code, said.count("mean error")) == (0, 3)
     # What the limb did too far to the left on average, the model is asked to do to the right.
     following = read_plan(out)
     assert following.method == "learned"
@@ -61,11 +55,11 @@ def test_two_bags_become_the_next_plan(planned, tmp_path, monkeypatch, capsys):
     change = following.differential_pressure - planned.differential_pressure
     assert change[seen, 0].sum() < 0
     again = tmp_path / "again.yaml"
-    assert call(monkeypatch, tmp_path / "bag1", "--plan", out, "--out", again) == 0
+    assert call(learn, tmp_path / "bag1", "--plan", out, "--out", again)[0] == 0
     assert np.isfinite(read_plan(again).differential_pressure).all()
 
 
-def test_what_cannot_be_learned_is_said(planned, tmp_path, monkeypatch, capsys):
+def test_what_cannot_be_learned_is_said(planned, tmp_path, call):
     write_bag(tmp_path / "bag", planned, SHIFT)
     motion = Motion.named("asynchronous", amplitude=0.4, period=4.0, cycles=1)
     write_plan(plan(Limb.default(), motion, method="projected"), tmp_path / "other.yaml")
@@ -74,5 +68,6 @@ def test_what_cannot_be_learned_is_said(planned, tmp_path, monkeypatch, capsys):
         (("--plan", tmp_path / "none.yaml", "--out", tmp_path / "o.yaml"), "cannot read the plan"),
         (("--plan", tmp_path / "other.yaml", "--out", tmp_path), "is a folder: name a file"),
     ):
-        assert call(monkeypatch, tmp_path / "bag", *arguments) == 2
-        assert said in capsys.readouterr().err
+        code, _, complaint = call(learn, tmp_path / "bag", *arguments)
+        assert code == 2
+        assert said in complaint

@@ -2,12 +2,12 @@
 
 import importlib
 import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from der_planner.commands import calibrate_limb, run_experiment
 from der_planner.experiment.processes import find_executable
 from der_planner.limb import Limb
 
@@ -16,24 +16,6 @@ SCRIPTS = Path(__file__).resolve().parents[3] / "scripts"
 
 LENS = ["intrinsics", "--out", "/tmp/never_written.yaml"]
 STANDING = ["--mounting", "standing", "--out", "/tmp/never_written.yaml"]
-
-
-@pytest.fixture
-def call(monkeypatch, capsys, tmp_path):
-    """Run a command's main; BUSY in its arguments is a path below a file."""
-    (tmp_path / "file").write_text("in the way")
-
-    def run(module, *arguments):
-        busy = str(tmp_path / "file" / "out")
-        line = [busy if word == "BUSY" else word for word in arguments]
-        monkeypatch.setattr(sys, "argv", [module, *line])
-        try:
-            code = importlib.import_module(module).main()
-        except SystemExit as error:
-            code = error.code
-        return code, capsys.readouterr().err
-
-    return run
 
 
 @pytest.mark.parametrize(
@@ -73,8 +55,12 @@ def call(monkeypatch, capsys, tmp_path):
         ("benchmarks.command", ["rod", "--json", "BUSY"], 2, "no folder"),
     ],
 )
-def test_mistakes_are_said_before_any_work_is_done(call, module, arguments, code, words):
-    found, said = call(module, *arguments)
+def test_mistakes_are_said_before_any_work_is_done(call, tmp_path, module, arguments, code, words):
+    """BUSY is a path below a file."""
+    (tmp_path / "file").write_text("in the way")
+    busy = tmp_path / "file" / "out"
+    line = [busy if word == "BUSY" else word for word in arguments]
+    found, _, said = call(importlib.import_module(module), *line)
     assert found == code
     assert "error: " in said
     assert words in said
@@ -85,14 +71,14 @@ def test_a_dry_run_plans_the_path_and_names_a_twin_that_the_limb_file_is_not_of(
     path.write_text("x [cm], y [cm]\n20, 10\n26, 10\n")
     replace(Limb.default(), provenance={"source": "twin, seed 3, run 1"}).to_yaml(limb)
     given = ("--dry-run", "--limb", str(limb), "--path", str(path))
-    found, said = call("der_planner.commands.run_experiment", *given)
+    found, _, said = call(run_experiment, *given)
     assert (found, "nearest=True; --nearest" in said) == (1, True)
-    found, said = call("der_planner.commands.run_experiment", *given, "--nearest")
+    found, _, said = call(run_experiment, *given, "--nearest")
     assert (found, "of the twin of seed 3, trials play on twins from seed 1 on" in said) == (
         0,
         True,
     )
-    found, said = call("der_planner.commands.run_experiment", *given, "--nearest", "--seed", "3")
+    found, _, said = call(run_experiment, *given, "--nearest", "--seed", "3")
     assert (found, "warning" in said) == (0, False)
 
 
@@ -100,7 +86,7 @@ def test_a_limb_unlike_the_twin_does_not_play_on_it(call, tmp_path):
     segment, file = Limb.default().segments[0], tmp_path / "limb.yaml"
     for segments in ((segment,), (replace(segment, length=0.04),) * 2):
         replace(Limb.default(), segments=segments).to_yaml(file)
-        found, said = call("der_planner.commands.run_experiment", "--dry-run", "--limb", str(file))
+        found, _, said = call(run_experiment, "--dry-run", "--limb", str(file))
         assert (found, "the twin has 2 segments and 0.244 m" in said) == (1, True)
 
 
@@ -108,7 +94,7 @@ def test_pressures_beyond_the_limit_start_nothing(call, tmp_path):
     table, out = tmp_path / "excitation.csv", str(tmp_path / "limb.yaml")
     table.write_text("time_s,a,b\n0,0,0\n0.05,0,30000\n")
     words = ("--graph", "--play", str(table), "--folder", str(tmp_path / "run"), "--out", out)
-    found, said = call("der_planner.commands.calibrate_limb", *words)
+    found, _, said = call(calibrate_limb, *words)
     assert (found, (tmp_path / "run").exists()) == (1, False)
     assert "asks for 30000 Pa, the limit is ±24000 Pa" in said
 

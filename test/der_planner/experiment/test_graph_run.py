@@ -25,20 +25,6 @@ def test_a_living_driver_vents_and_the_port_of_a_dead_one_is_given_time(alive: b
     assert (warned in capsys.readouterr().err) == alive
 
 
-class Silent:
-    """A client that hears nothing, or a node with other messages."""
-
-    def __init__(self, heard: bool) -> None:
-        self._heard = heard
-
-    def wait_ready(self, names: list[str], *_: float) -> None:
-        if not self._heard:
-            raise GraphError(f"node '{next(iter(names))}' was not ready")
-
-    def diagnostic_values(self, _: str) -> dict[str, str]:
-        return {"messages": "12345678"}
-
-
 @pytest.mark.parametrize(
     ("heard", "told"),
     [
@@ -47,7 +33,10 @@ class Silent:
     ],
 )
 def test_a_node_elsewhere_that_is_missing_or_of_another_version_is_named(heard: bool, told: str):
-    graph = RunningGraph(Silent(heard), Progress(), elsewhere={"apriltag_tracker": "camera-pc"})
+    client = Mock()
+    client.wait_ready.side_effect = None if heard else GraphError("a node was not ready")
+    client.diagnostic_values.return_value = {"messages": "12345678"}
+    graph = RunningGraph(client, Progress(), elsewhere={"apriltag_tracker": "camera-pc"})
     with pytest.raises(GraphError, match=told):
         graph._wait_elsewhere()
 
@@ -56,10 +45,8 @@ def test_a_node_elsewhere_that_is_missing_or_of_another_version_is_named(heard: 
     ("message", "said"), [("another clock", True), (Offset(0.045, 0.02).warning, False)]
 )
 def test_what_a_tracker_warns_of_is_said_before_it_is_played(capsys, tmp_path, message, said):
-    client = Silent(True)
     # Whose clock is off is said by what is known when the limb is armed.
-    client.diagnostic_values = lambda _: {"clock_offset_s": "0.045", "clock_uncertainty_s": "0.02"}
     warned = DiagnosticStatus(level=DiagnosticStatus.WARN, message=message)
-    client.diagnostics = {"apriltag_tracker": warned}
+    client = Mock(diagnostics={"apriltag_tracker": warned})
     RunningGraph(client, Progress()).start([], tmp_path, {})
     assert (f"warning: apriltag_tracker: {message}" in capsys.readouterr().err) == said

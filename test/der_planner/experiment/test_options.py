@@ -10,7 +10,7 @@ from der_planner.commands.run_experiment import Ledger
 from der_planner.experiment.console import OptionError
 from der_planner.experiment.options import parse
 from der_planner.experiment.processes import GraphSetup, Hardware
-from der_planner.limb import Limb, PointMass
+from der_planner.limb import Limb, Load
 from der_planner.planning import ObstacleError
 
 
@@ -147,16 +147,8 @@ def test_a_motion_into_an_obstacle_is_refused_before_anything_is_started(tmp_pat
 
 def test_the_load_is_that_of_the_command_line():
     options = parse(["--mounting", "hanging", "--payload", "0.02", "--payload-at", "0.2"])
-    default = Limb.default()
-    assert default.loaded(options.load) == default.mounted("hanging").carrying(0.02, 0.2)
-    assert default.loaded(options.load).masses == (PointMass(0.2, 0.02, "payload"),)
-    # A calibrated limb is a little shorter or longer than the place that was measured.
-    at_tip = default.loaded(parse(["--payload", "0.02", "--payload-at", "0.2465"]).load)
-    assert at_tip.masses[0].arc_length == default.length
-    assert at_tip.payload == (0.02, 0.0)
-    assert default.loaded(options.load).payload == (0.02, 0.2)
-    hung = default.mounted("30")
-    assert hung.loaded(parse([]).load) == hung
+    assert options.load == Load(0.02, 0.2, "hanging")
+    assert parse([]).load == Load()
 
 
 def test_a_path_is_refused_with_its_line_and_the_remedy(tmp_path: Path):

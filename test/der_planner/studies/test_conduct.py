@@ -1,6 +1,5 @@
 """A study is played: on processes of this machine, on a cluster that breaks, and after a stop."""
 
-import json
 import os
 import signal
 import subprocess
@@ -15,13 +14,7 @@ from distributed import LocalCluster
 
 from der_planner.experiment.console import Progress
 from der_planner.studies import conduct as conducting
-from der_planner.studies.conduct import (
-    Outcome,
-    PlaySettings,
-    Store,
-    compute,
-    conduct,
-)
+from der_planner.studies.conduct import Outcome, PlaySettings, Store, compute, conduct
 from der_planner.studies.factors import StudyError
 from der_planner.studies.report import summarise
 from der_planner.studies.study import Study
@@ -73,14 +66,6 @@ def cluster() -> Iterator[str]:
         yield running.scheduler_address
 
 
-def by_key(folder: Path) -> dict[str, dict]:
-    """Return the record of every whole line by its key."""
-    file = folder / "rows.jsonl"
-    text = file.read_text() if file.exists() else ""
-    lines = [line for line in text.splitlines() if line.endswith("}")]
-    return {record["key"]: record for record in map(json.loads, lines)}
-
-
 def test_rows_that_fail_are_kept_and_done_again_if_that_is_asked_for(tmp_path, cluster):
     """To the same last digit."""
     study = Study.read(write(tmp_path, RODS))
@@ -123,7 +108,7 @@ def test_a_cluster_that_breaks(tmp_path, cluster):
         with pytest.raises(StudyError, match=r"scheduler is gone.*same command goes on from here"):
             conduct(study, settings, Breaking(doomed))
     kept = (out / "rows.jsonl").read_text()
-    assert 4 <= len(by_key(out)) < len(study.rows)
+    assert 4 <= len(Store(out, study).load()) < len(study.rows)
     found = conduct(study, PlaySettings(out, cluster), Progress())
     assert list(found) == [row.key for row in study.rows]
     assert {record["error"] for record in found.values()} == {None}
@@ -140,7 +125,7 @@ def test_a_stopped_study_goes_on(tmp_path, cluster):
     with subprocess.Popen(
         [*command, "--workers", "1"], stderr=subprocess.PIPE, text=True
     ) as running:
-        while len(by_key(out)) < 2:
+        while len(Store(out, study).load()) < 2:
             assert running.poll() is None, running.communicate()
             time.sleep(0.02)
         running.send_signal(signal.SIGTERM)
@@ -152,7 +137,7 @@ def test_a_stopped_study_goes_on(tmp_path, cluster):
     rows.write_bytes(rows.read_bytes()[:-30])
     more = ["--scheduler", cluster, "--limit", "5"]
     subprocess.run([*command, *more], check=True, timeout=600)
-    stopped = by_key(out)
+    stopped = Store(out, study).load()
     assert {row.key for row in study.rows[:5]} <= set(stopped)
     # The first row came from a process of this machine, the last one from the cluster.
     for row in (study.rows[0], study.rows[4]):

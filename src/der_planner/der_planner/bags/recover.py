@@ -150,22 +150,17 @@ def _topic_spec(channel: Channel, schema: Schema) -> TopicSpec:
 
 
 def _bag_files(path: Path) -> list[Path]:
-    """Return the MCAP files of a bag in the order of their numbers.
+    """Return the MCAP files of a bag in the order of their numbers, which end their names.
 
     Raises:
         RecoverError: there are none.
     """
     if path.is_file():
         return [path]
-    found = sorted(path.glob("*.mcap"), key=_file_number)
+    found = sorted(path.glob("*.mcap"), key=lambda file: (len(file.name), file.name))
     if not found:
         raise RecoverError(f"{path} holds no MCAP file; sqlite3: `ros2 bag reindex {path}`")
     return found
-
-
-def _file_number(path: Path) -> tuple[int, str]:
-    tail = path.stem.rsplit("_", 1)[-1]
-    return (int(tail) if tail.isdigit() else 0, path.name)
 
 
 def recover_bag(path: Path, folder: Path | None = None) -> Recovery:

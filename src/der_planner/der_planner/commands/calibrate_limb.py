@@ -36,15 +36,12 @@ import numpy as np
 
 from der_planner.experiment.console import (
     OptionError,
-    Progress,
     add_load_options,
     check_file,
     check_folder,
     check_limb_file,
-    command_parser,
+    command,
     given_load,
-    interrupt_once,
-    run_command,
 )
 from der_planner.experiment.processes import GraphError, Hardware, NodeError
 from der_planner.files import write_whole
@@ -71,7 +68,7 @@ from der_planner.identification.readers import ask_map, read_table
 from der_planner.identification.report import plot_prediction
 from der_planner.identification.stiffness import FREE, REST
 from der_planner.identification.terms import GROUPS
-from der_planner.limb import Limb, LimbError, Load
+from der_planner.limb import Limb, LimbError
 from der_planner.model import CONTROL_PERIOD
 from der_planner.planning.loads import nearly_buckling
 
@@ -79,17 +76,10 @@ LAST_PART = 0.25
 """Share of a LOG that is kept back to judge the fit."""
 
 
-def main() -> int:
+@command(LogError, LimbError, GraphError, NodeError, OSError, stopped="no limb file was written")
+def main(parser: argparse.ArgumentParser) -> int:
     """Run the command line: 0 when a limb file was written, 1 after an error, 2 for bad options."""
-    given = _parser().parse_args()
-    return run_command(
-        lambda: _main(given),
-        *(LogError, LimbError, GraphError, NodeError, OSError),
-        stopped="no limb file was written",
-    )
-
-
-def _main(given: argparse.Namespace) -> int:
+    given = _options(parser)
     _check(given)
     load = given_load(given)
     bare = Limb.from_yaml(given.prior) if given.prior else Limb.default()
@@ -123,7 +113,8 @@ def _main(given: argparse.Namespace) -> int:
         provenance = {**limb.provenance, "weighed_kg": given.mass}
         limb = dataclasses.replace(limb, provenance=provenance)
     unseen = [*kept_back, *held_out]
-    kept = _unloaded(limb, load)
+    # The payload, which was put on last, belongs to the log alone.
+    kept = dataclasses.replace(limb, masses=limb.masses[:-1]) if load.payload else limb
     lines = [report.text(), *(_held_out_text(limb, each, given.longest_gap) for each in unseen)]
     text = "\n".join([*lines, _weight(kept, given)])
     print(text)
@@ -136,8 +127,7 @@ def _main(given: argparse.Namespace) -> int:
     return 0
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = command_parser(__doc__)
+def _options(parser: argparse.ArgumentParser) -> argparse.Namespace:
     source = parser.add_mutually_exclusive_group(required=True)
     source.add_argument("--offline", action="store_true", help="calibrate the twin of --seed")
     source.add_argument(
@@ -213,7 +203,7 @@ def _parser() -> argparse.ArgumentParser:
         help="limb file to write (default: limb.yaml)",
     )
     parser.add_argument("--report", type=Path, help="folder for report.txt and prediction.png")
-    return parser
+    return parser.parse_args()
 
 
 def _terms(text: str) -> list[str]:
@@ -268,11 +258,6 @@ def _check(given: argparse.Namespace) -> None:
     check_limb_file(given.out)
     if given.report:
         check_folder(given.report, "--report")
-
-
-def _unloaded(limb: Limb, load: Load) -> Limb:
-    """Return a limb without the payload of a load, which was put on last."""
-    return dataclasses.replace(limb, masses=limb.masses[:-1]) if load.payload else limb
 
 
 def _weight(limb: Limb, given: argparse.Namespace) -> str:
@@ -341,14 +326,13 @@ def _play_on_graph(prior: Limb, given: argparse.Namespace) -> Path:
     # ROS is imported only by who needs it.
     from der_planner.experiment.graph_trials import play_calibration  # noqa: PLC0415
 
-    interrupt_once()
     hardware = Hardware.from_yaml(given.hardware) if given.hardware else None
     driver = (hardware or Hardware()).limits
     limit = min(prior.pneumatics.pressure_limit, driver.pressure_limit)
     # Steps may be faster than the limb's own slew_limit, which is for plans: they show how the air
     # follows. The driver's limit holds for every setpoint.
     run = within_limits(_excitation(prior, limit, given), limit, driver.slew_limit)
-    return play_calibration(run, given.folder, Progress(), prior, given.seed, hardware)
+    return play_calibration(run, given.folder, prior, given.seed, hardware)
 
 
 def _held_out_text(limb: Limb, log: CalibrationLog, longest_gap: float) -> str:

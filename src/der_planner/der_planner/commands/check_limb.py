@@ -24,22 +24,18 @@ from der_planner.experiment.console import (
     OptionError,
     add_load_options,
     check_limb_file,
-    command_parser,
+    command,
     given_load,
     loaded,
-    run_command,
 )
 from der_planner.identification import CalibrationLog, LogError, check, read_log, update
 from der_planner.limb import Limb, LimbError
 
 
-def main() -> int:
+@command(LogError, LimbError, OSError)
+def main(parser: argparse.ArgumentParser) -> int:
     """Run the command line."""
-    given = _parser().parse_intermixed_args()
-    return run_command(lambda: _main(given), LogError, LimbError, OSError)
-
-
-def _main(given: argparse.Namespace) -> int:
+    given = _options(parser)
     if given.out is not None:
         if not given.update:
             raise OptionError("--out is the updated limb file: give --update, too")
@@ -54,8 +50,7 @@ def _main(given: argparse.Namespace) -> int:
     return max([_check(under_load, log, len(logs) > 1) for log in logs])
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = command_parser(__doc__)
+def _options(parser: argparse.ArgumentParser) -> argparse.Namespace:
     parser.add_argument(
         "runs", nargs="+", type=Path, metavar="BAG", help="bags of runs, or CSV tables"
     )
@@ -67,7 +62,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--out", type=Path, metavar="FILE", help="updated limb file, a new one")
     add_load_options(parser)
-    return parser
+    return parser.parse_intermixed_args()
 
 
 def _check(limb: Limb, log: CalibrationLog, named: bool) -> int:

@@ -28,15 +28,7 @@ from apriltag_tracker.pose.clamp import Clamp, at_clamp, find_clamp
 from apriltag_tracker.tag_map import MapError, TagMap
 from der_planner.bags.reader import BagError, BagReader
 from der_planner.bags.record import PRESSURE_TYPE, Columns, header_stamp
-from der_planner.experiment.console import (
-    OptionError,
-    Progress,
-    check_file,
-    check_folder,
-    command_parser,
-    interrupt_once,
-    run_command,
-)
+from der_planner.experiment.console import OptionError, check_file, check_folder, command
 from der_planner.experiment.processes import GraphError, Hardware, NodeError
 from der_planner.files import write_whole
 from der_planner.identification.excitation import within_limits
@@ -53,17 +45,11 @@ CLAMP_OFF = (0.002, 0.002, float(np.deg2rad(1.5)))
 """What the clamp may be beside the origin of `limb_base` [m, m, rad]."""
 SEEN_TOGETHER = 10
 """Messages of each kind that a bag must hold."""
+FAILURES = (RigError, SettingError, BagError, MapError, TwinError, GraphError, NodeError, OSError)
+"""What may end a check early."""
 
 
-def main() -> int:
-    """Run the command line."""
-    given = _parser().parse_args()
-    errors = (RigError, SettingError, BagError, MapError, TwinError, GraphError, NodeError)
-    return run_command(lambda: _main(given), *errors, OSError, stopped="no rig file was written")
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = command_parser(__doc__)
+def _options(parser: argparse.ArgumentParser) -> argparse.Namespace:
     parser.add_argument("--hardware", type=Path, metavar="FILE", help="rig file to begin with")
     parser.add_argument("--bag", type=Path, help="judge a check that was recorded before")
     parser.add_argument(
@@ -81,10 +67,13 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--poses", action="store_true", help="of the twin: motion capture, no tags")
     parser.add_argument("--folder", type=Path, help="for bag and logs (default: checks/ and time)")
     parser.add_argument("--out", type=Path, metavar="FILE", help="rig file to write")
-    return parser
+    return parser.parse_args()
 
 
-def _main(given: argparse.Namespace) -> int:
+@command(*FAILURES, stopped="no rig file was written")
+def main(parser: argparse.ArgumentParser) -> int:
+    """Run the command line."""
+    given = _options(parser)
     if given.hardware and (given.wiring or given.poses):
         raise OptionError("--wiring and --poses are about the twin: leave --hardware out")
     content: dict[str, Any] = {"driver": {"protocol": given.board}, "twin": {}}
@@ -176,13 +165,12 @@ def _play(given: argparse.Namespace, hardware: Hardware) -> Path:
     # ROS is imported only by who needs it.
     from der_planner.experiment.graph_trials import play_calibration  # noqa: PLC0415
 
-    interrupt_once()
     folder = given.folder or Path("checks") / time.strftime("%Y-%m-%d_%H-%M-%S")
     check_folder(folder, "--folder")
     driver = hardware.limits
     run = check_run(driver.segment_count, given.pressure or GENTLE * driver.pressure_limit)
     run = within_limits(run, np.inf, driver.slew_limit)  # the driver refuses what is beyond its own
-    return play_calibration(run, folder.resolve(), Progress(), Limb.default(), given.seed, hardware)
+    return play_calibration(run, folder.resolve(), Limb.default(), given.seed, hardware)
 
 
 def _map_path(hardware: Hardware) -> Path:

@@ -19,22 +19,18 @@ import numpy as np
 from der_planner.arrays import Array
 from der_planner.commands.learn import FAILURES, add_plan_options, in_hindsight, plan_of
 from der_planner.control.hindsight import Smoothed, smooth
-from der_planner.experiment.console import check_file, command_parser, run_command
+from der_planner.experiment.console import check_file, command
 from der_planner.results import RunSeries, load_run
 
 
-def main() -> int:
+@command(*FAILURES, code=2)
+def main(parser: argparse.ArgumentParser) -> int:
     """Run the command line."""
-    parser = command_parser(__doc__)
     parser.add_argument("bag", type=Path, metavar="BAG", help="of a run")
     parser.add_argument("--out", type=Path, metavar="FILE", help="table (CSV) to write")
     add_plan_options(parser)
     parser.add_argument("--namespace", default="", help="of the limb, where a bag holds several")
     given = parser.parse_args()
-    return run_command(lambda: _estimate(given), *FAILURES, code=2)
-
-
-def _estimate(given: argparse.Namespace) -> int:
     if given.out is not None:
         check_file(given.out)
     run = load_run(given.bag, namespace=given.namespace)

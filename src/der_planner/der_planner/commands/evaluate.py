@@ -18,13 +18,7 @@ from pathlib import Path
 
 from der_planner.commands.learn import FAILURES, add_plan_options, in_hindsight, plan_of
 from der_planner.control.hindsight import touches
-from der_planner.experiment.console import (
-    Progress,
-    check_file,
-    check_folder,
-    command_parser,
-    run_command,
-)
+from der_planner.experiment.console import Progress, check_file, check_folder, command
 from der_planner.results import (
     RunSeries,
     compare,
@@ -37,8 +31,7 @@ from der_planner.results import (
 from der_planner.results.overlay import write_video
 
 
-def _arguments() -> argparse.Namespace:
-    parser = command_parser(__doc__)
+def _options(parser: argparse.ArgumentParser) -> argparse.Namespace:
     parser.add_argument(
         "bags", nargs="+", type=Path, metavar="BAG", help="bags, or experiment folders"
     )
@@ -77,13 +70,10 @@ def expand(paths: list[Path]) -> list[Path]:
     return found
 
 
-def main() -> int:
+@command(*FAILURES, OSError)
+def main(parser: argparse.ArgumentParser) -> int:
     """Run the command line; 0 when every bag was evaluated, 1 otherwise."""
-    given = _arguments()
-    return run_command(lambda: _evaluate(given), *FAILURES, OSError)
-
-
-def _evaluate(given: argparse.Namespace) -> int:
+    given = _options(parser)
     for name in ("report", "results"):
         if getattr(given, name) is not None:
             check_folder(getattr(given, name), f"--{name}")

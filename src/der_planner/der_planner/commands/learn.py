@@ -21,7 +21,7 @@ import numpy as np
 
 from der_planner.control import Learner, LearningError
 from der_planner.control.hindsight import Filmed, touches
-from der_planner.experiment.console import check_file, command_parser, run_command
+from der_planner.experiment.console import check_file, command
 from der_planner.limb import Limb, LimbError, Load
 from der_planner.planning import Motion, Obstacles, Plan, PlanningError, plan
 from der_planner.planning.motions import NAMES
@@ -36,18 +36,14 @@ _SAME_POINT = 2e-3
 """References whose points lie further apart than this [m] are not of one motion."""
 
 
-def main() -> int:
+@command(*FAILURES, code=2)
+def main(parser: argparse.ArgumentParser) -> int:
     """Run the command line."""
-    parser = command_parser(__doc__)
     parser.add_argument("bags", nargs="+", type=Path, metavar="BAG", help="bags, oldest first")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the next plan")
     add_plan_options(parser)
     parser.add_argument("--namespace", default="", help="of the limb, where a bag holds several")
     given = parser.parse_args()
-    return run_command(lambda: _learn(given), *FAILURES, code=2)
-
-
-def _learn(given: argparse.Namespace) -> int:
     check_file(given.out)
     runs = [load_run(bag, namespace=given.namespace) for bag in given.bags]
     first = plan_of(runs[0], given)

@@ -27,13 +27,7 @@ from der_planner.bags.reader import BagError, BagReader, RawMessage, RecordedTop
 from der_planner.bags.record import NANOSECONDS
 from der_planner.bags.topics import DefinitionError, message_class
 from der_planner.experiment.client import GraphClient
-from der_planner.experiment.console import (
-    OptionError,
-    Progress,
-    command_parser,
-    interrupt_once,
-    run_command,
-)
+from der_planner.experiment.console import OptionError, Progress, command, interrupt_once
 from der_planner.experiment.processes import GraphError
 from limb_interfaces import qos
 
@@ -46,13 +40,6 @@ PATIENCE = 3.0
 """Longest wait for one answer [s]; then the message is sent again."""
 SETTLE = 0.3
 """Time [s] for a receiver's callback after the first message of a topic that nothing answers."""
-
-
-def main() -> int:
-    """Run the command line."""
-    given = _arguments()
-    interrupt_once()
-    return run_command(lambda: _replay(given), BagError, DefinitionError, GraphError)
 
 
 # What is played ---------------------------------------------------------------------------------
@@ -227,8 +214,7 @@ class GraphOutput:
         self._clock.publish(message)
 
 
-def _arguments() -> argparse.Namespace:
-    parser = command_parser(__doc__)
+def _options(parser: argparse.ArgumentParser) -> argparse.Namespace:
     parser.add_argument("bag", type=Path, metavar="BAG", help="folder, .mcap or .db3 file")
     parser.add_argument("--rate", type=float, default=1.0, help="0: as fast as possible")
     parser.add_argument("--from", dest="start", type=float, default=0.0, metavar="S")
@@ -249,7 +235,11 @@ def _pairs(values: list[str], what: str) -> dict[str, str]:
     return dict(value.split("=") for value in values)
 
 
-def _replay(given: argparse.Namespace) -> int:
+@command(BagError, DefinitionError, GraphError)
+def main(parser: argparse.ArgumentParser) -> int:
+    """Run the command line."""
+    given = _options(parser)
+    interrupt_once()
     if given.rate < 0:
         raise OptionError(f"--rate is {given.rate}: choose 0 or more")
     wanted = Selection(given.start, given.stop, given.topics, _pairs(given.remap, "--remap"))

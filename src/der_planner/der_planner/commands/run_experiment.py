@@ -1,6 +1,6 @@
 """Play motions on the limb or its twin and report the tracking error: the main command.
 
-    python3 scripts/run_experiment.py
+    python3 scripts/run_experiment.py        (Case 2, same_direction, DER and PCC, one trial each)
     python3 scripts/run_experiment.py --motions all --method optimal --trials 5
     python3 scripts/run_experiment.py --offline --motions all --trials 5
     python3 scripts/run_experiment.py --hardware my_rig.yaml --limb my_limb.yaml
@@ -12,6 +12,7 @@ Everything else is one path.
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import hashlib
 import json
@@ -28,9 +29,9 @@ from der_planner.experiment.console import (
     OptionError,
     Progress,
     check_folder,
+    command,
     interrupt_once,
     loaded,
-    run_command,
 )
 from der_planner.experiment.offline_run import load_arrays, play_offline
 from der_planner.experiment.options import Options, Trial, TrialRun, parse
@@ -65,13 +66,10 @@ FAILURES = (GraphError, NodeError, PlanningError, LearningError, LogError, OSErr
 """What may end an experiment before its last trial."""
 
 
-def main() -> int:
+@command(*FAILURES, stopped="the same --out goes on from here")
+def main(parser: argparse.ArgumentParser) -> int:
     """Run the command line; 0 when every trial was played, 1 after an error, 2 for bad options."""
-    return run_command(_main, *FAILURES, stopped="the same --out goes on from here")
-
-
-def _main() -> int:
-    options = parse(sys.argv[1:])
+    options = parse(sys.argv[1:], parser)
     if not options.offline:
         interrupt_once()
     if options.page is None or options.dry_run:

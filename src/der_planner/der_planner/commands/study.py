@@ -14,13 +14,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from der_planner.experiment.console import (
-    OptionError,
-    Progress,
-    command_parser,
-    interrupt_once,
-    run_command,
-)
+from der_planner.experiment.console import OptionError, Progress, command, interrupt_once
 from der_planner.studies.conduct import PlaySettings, Store, conduct
 from der_planner.studies.factors import ERROR, PLANNED, StudyError, limb_parameters, of_task
 from der_planner.studies.report import means_table, summarise
@@ -28,8 +22,7 @@ from der_planner.studies.study import SHIPPED, Study
 from der_planner.studies.tasks import TASKS
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = command_parser(__doc__)
+def _options(parser: argparse.ArgumentParser) -> argparse.Namespace:
     parser.add_argument("study", nargs="?", metavar="STUDY.yaml", help="file, or a shipped name")
     parser.add_argument(
         "--scheduler",
@@ -56,28 +49,24 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--list", action="store_true", help="shipped studies, tasks, factors and columns"
     )
-    return parser
+    return parser.parse_args()
 
 
-def main() -> int:
+@command(
+    StudyError,
+    stopped="what was done is kept, and the same command with the same --out goes on from here",
+)
+def main(parser: argparse.ArgumentParser) -> int:
     """Run the command line.
 
     Returns:
         0 when every row is done, also failed ones; 1 if the study could not be played; 2 for a bad
         option; 130 if it was stopped.
     """
-    given = _parser().parse_args()
+    given = _options(parser)
     if given.list:
         print(_listing())
         return 0
-    return run_command(
-        lambda: _play(given),
-        StudyError,
-        stopped="what was done is kept, and the same command with the same --out goes on from here",
-    )
-
-
-def _play(given: argparse.Namespace) -> int:
     if given.study is None:
         raise OptionError("name a study: a file, or one of those that --list shows")
     for name in ("workers", "limit"):

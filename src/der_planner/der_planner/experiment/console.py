@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import functools
 import os
 import signal
 import sys
@@ -93,38 +94,43 @@ def interrupt_once() -> None:
     on_end_signals(interrupt)
 
 
-def command_parser(text: str | None) -> argparse.ArgumentParser:
-    """Return the parser of a command whose module's text is shown by --help as it stands."""
-    return argparse.ArgumentParser(
-        description=text, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def command(
+    *failures: type[Exception], stopped: str = "", code: int = 1
+) -> Callable[[Callable[[argparse.ArgumentParser], int]], Callable[[], int]]:
+    """Return a decorator for the main function of a command: why it ended early is said on stderr.
 
-
-def run_command(
-    work: Callable[[], int], *failures: type[Exception], stopped: str = "", code: int = 1
-) -> int:
-    """Return the exit code of a command, and say on stderr why it ended early.
+    The function gets a parser whose --help shows the text of its module as it stands. Its exit code
+    is 2 for options that cannot be, and for results that cannot be written where they are wanted;
+    130 after a signal.
 
     Args:
-        work: what the command does; returns its own exit code.
         failures: what may go wrong besides the options and the places of results.
         stopped: what a user who stopped the command has to know.
         code: of a failure.
-
-    Returns:
-        What ``work`` returns; 2 for options that cannot be, and for results that cannot be written
-        where they are wanted; 130 after a signal.
     """
-    try:
-        return work()
-    except OptionError as error:
-        code, said = 2, f"error: {error}"
-    except failures as error:
-        said = f"error: {error}"
-    except KeyboardInterrupt as error:
-        code, said = 130, f"stopped by {error or 'SIGINT'}{stopped and '; '}{stopped}"
-    print(said, file=sys.stderr)
-    return code
+
+    def decorate(work: Callable[[argparse.ArgumentParser], int]) -> Callable[[], int]:
+        @functools.wraps(work)
+        def main() -> int:
+            parser = argparse.ArgumentParser(
+                description=sys.modules[work.__module__].__doc__,
+                formatter_class=argparse.RawDescriptionHelpFormatter,
+            )
+            try:
+                return work(parser)
+            except OptionError as error:
+                ended, said = 2, f"error: {error}"
+            except failures as error:
+                ended, said = code, f"error: {error}"
+            except KeyboardInterrupt as error:
+                ended = 130
+                said = f"stopped by {error or 'SIGINT'}{stopped and '; '}{stopped}"
+            print(said, file=sys.stderr)
+            return ended
+
+        return main
+
+    return decorate
 
 
 # Places of results: known to be writable before hours of work, not after -----------------------

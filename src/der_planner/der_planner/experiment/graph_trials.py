@@ -14,7 +14,7 @@ from nav_msgs.msg import Path as PathMessage
 
 from der_msgs.msg import MotionCommand, PressurePlan, PressureSetpoint
 from der_planner.experiment.client import GraphClient
-from der_planner.experiment.console import Progress
+from der_planner.experiment.console import Progress, interrupt_once
 from der_planner.experiment.graph_run import running_graph
 from der_planner.experiment.options import TrialRun
 from der_planner.experiment.processes import GraphError, GraphSetup, Hardware
@@ -193,17 +193,17 @@ def warning_of(told: Mapping[str, str], plan_id: str) -> str:
 def play_calibration(
     excitation: Excitation,
     folder: Path,
-    progress: Progress,
     prior: Limb,
     seed: int = 0,
     hardware: Hardware | None = None,
 ) -> Path:
     """Play the pressures of a calibration; say when the driver did not take all of them.
 
+    A signal ends it with the limb vented.
+
     Args:
         excitation: pressures to play, on the grid of 50 ms.
         folder: gets the bag (``bag``) and the nodes' logs (``logs``).
-        progress: shows what happens.
         prior: whose gravity and masses the twin gets.
         seed: of the twin.
         hardware: in place of the twin.
@@ -214,7 +214,8 @@ def play_calibration(
     Raises:
         GraphError, NodeError: as `play_on_graph`.
     """
-    count = len(excitation.time)
+    interrupt_once()
+    progress, count = Progress(), len(excitation.time)
     real = hardware is not None and hardware.twin is None
     stage = f"the hardware at {hardware.place}" if hardware and real else f"the twin of seed {seed}"
     progress.say(f"playing {excitation.duration:.0f} s on {stage}, into {folder}")

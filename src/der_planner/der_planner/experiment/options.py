@@ -87,6 +87,11 @@ def _option(default: Any, text: str, within: tuple[float, float] | None = None, 
     return field(default=default, metadata={"help": text, "within": within, **more})
 
 
+def _place(kind: str, text: str) -> Any:
+    """Return the field of an option that names a file or a folder, which --help calls ``kind``."""
+    return _option(None, text, type=Path, metavar=kind)
+
+
 @dataclass(frozen=True)
 class Options:
     """A parsed and checked command line. Each field with a help text is an option."""
@@ -98,12 +103,10 @@ class Options:
         choices=(*MOTIONS, "all"),
         metavar="MOTION",
     )
-    path: Path | None = _option(
-        None,
+    path: Path | None = _place(
+        "FILE.csv",
         "draw this path with the tip, in place of --motions: columns x, y and, if timed, time, "
         "with units as in 'time [s], x [cm], y [cm]' (default units: s and m)",
-        type=Path,
-        metavar="FILE.csv",
     )
     nearest: bool = _option(
         False, "follow the nearest path that the limb can follow where --path leaves its reach"
@@ -119,19 +122,14 @@ class Options:
         (0, 100),
         metavar="N",
     )
-    library: Path | None = _option(
-        None,
-        "of learned plans: trials begin from the nearest one, if it is near",
-        type=Path,
-        metavar="FOLDER",
+    library: Path | None = _place(
+        "FOLDER", "of learned plans: trials begin from the nearest one, if it is near"
     )
     trials: int = _option(1, "runs of each motion and model", (1, 1000))
     amplitude: float = _option(DEFAULT_AMPLITUDE, "largest bend of a segment [rad]", (0.01, 2.0))
     period: float = _option(DEFAULT_PERIOD, "of one cycle [s]", (0.5, 600.0))
     cycles: int = _option(DEFAULT_CYCLES, "cycles of the motion", (1, 1000))
-    limb: Path | None = _option(
-        None, "limb file; without it each twin is calibrated first", type=Path, metavar="FILE"
-    )
+    limb: Path | None = _place("FILE", "limb file; without it each twin is calibrated first")
     calibrate: bool = _option(
         True,
         "plan with the default limb file, as if the twin were that limb",
@@ -142,22 +140,15 @@ class Options:
     )
     load: Load = Load()
     board: str = _option(BOARDS[0], "of the twin", choices=BOARDS)
-    obstacles: Path | None = _option(
-        None,
-        "what is in the limb's way (YAML): plans keep off it, and the twin runs into it",
-        type=Path,
-        metavar="FILE",
+    obstacles: Path | None = _place(
+        "FILE", "what is in the limb's way (YAML): plans keep off it, and the twin runs into it"
     )
-    hardware: Hardware | None = _option(
-        None, "a real valve board and camera instead of the twin", type=Path, metavar="FILE"
-    )
+    hardware: Hardware | None = _place("FILE", "a real valve board and camera instead of the twin")
     offline: bool = _option(False, "without ROS, in one process, faster than real time")
-    out: Path = _option(
-        None,
+    out: Path = _place(
+        "DIR",
         "folder of bags, logs, figures and results.json; a folder that holds a stopped "
         "experiment goes on with it; without it: experiments/ and the time",
-        type=Path,
-        metavar="DIR",
     )
     feedback: bool = _option(
         False, "play every plan of the rod twice: open loop, and corrected while it moves"
@@ -282,16 +273,10 @@ class TrialRun(NamedTuple):
         return plan(self.limb, motion, trial.model, trial.method, obstacles=self.options.in_the_way)
 
 
-def parser() -> argparse.ArgumentParser:
-    """Return the parser of the command line."""
-    result = argparse.ArgumentParser(
-        prog="run_experiment.py",
-        description="Play motions on the limb (or its twin) and report the tracking error.",
-        epilog="Without options: Case 2 (same_direction), DER and PCC, one trial each, on the twin",
-    )
+def _add_options(parser: argparse.ArgumentParser) -> None:
     for each in dataclasses.fields(Options):
         if each.name == "load":
-            add_load_options(result)
+            add_load_options(parser)
             continue
         told = {key: value for key, value in each.metadata.items() if key != "within"}
         flag = told.pop("flag", f"--{each.name.replace('_', '-')}")
@@ -302,18 +287,23 @@ def parser() -> argparse.ArgumentParser:
             told["help"] += f" (default: {' '.join(map(str, shown))})"
         if isinstance(each.default, (int, float)) and "action" not in told:
             told["type"] = type(each.default)
-        result.add_argument(flag, dest=each.name, default=each.default, **told)
-    return result
+        parser.add_argument(flag, dest=each.name, default=each.default, **told)
 
 
-def parse(arguments: Sequence[str]) -> Options:
+def parse(arguments: Sequence[str], parser: argparse.ArgumentParser | None = None) -> Options:
     """Parse and check a command line.
+
+    Args:
+        arguments: of the command line.
+        parser: gets the options; None: one without a text for --help.
 
     Raises:
         OptionError: a number out of range, an unreadable file, or options that do not go together.
         SystemExit: after --help, or when argparse itself refuses, as an unknown name.
     """
-    given = parser().parse_args(arguments)
+    parser = parser or argparse.ArgumentParser()
+    _add_options(parser)
+    given = parser.parse_args(arguments)
     values: dict[str, Any] = {}
     for each in dataclasses.fields(Options):
         value = values[each.name] = getattr(given, each.name, None)

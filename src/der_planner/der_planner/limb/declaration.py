@@ -6,12 +6,12 @@ comment behind the key in a limb file, its row on the site's page and the unknow
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import re
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
+from functools import partial
+from typing import Any, get_args, get_origin, get_type_hints
 
 _KEY = "parameter"
 
@@ -61,7 +61,7 @@ class Term:
         """Return the term for limbs of a pressure limit [Pa]."""
         unit = pressure_limit**self.per_limit
         keys = ("scale", "low", "high", "spread", "start")
-        return dataclasses.replace(self, **{key: unit * getattr(self, key) for key in keys})
+        return replace(self, **{key: unit * getattr(self, key) for key in keys})
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ def parameter(
     text: str,
     choose: str,
     *,
-    default: Any = dataclasses.MISSING,
+    default: Any = MISSING,
     interval: str = "(-inf, inf)",
     needs: str = "",
     fit: Term | None = None,
@@ -135,11 +135,17 @@ def parameter(
     return field(default=default, metadata={_KEY: declared})
 
 
+positive = partial(parameter, interval="(0, inf)")
+"""A parameter that every limb has."""
+effect = partial(parameter, default=0.0, interval="[0, inf)")
+"""A parameter of something that a limb may show or have; 0: it does not."""
+signed_effect = partial(parameter, default=0.0)
+"""The same where it has a direction."""
+
+
 def declarations(kind: Any) -> dict[str, Parameter]:
     """Return the declared parameters of a dataclass by name, in their order."""
-    return {
-        item.name: item.metadata[_KEY] for item in dataclasses.fields(kind) if _KEY in item.metadata
-    }
+    return {item.name: item.metadata[_KEY] for item in fields(kind) if _KEY in item.metadata}
 
 
 def check(item: Any, where: str = "") -> None:
@@ -159,13 +165,17 @@ def check(item: Any, where: str = "") -> None:
             )
 
 
-def commented(text: str, sections: Mapping[str, Mapping[str, Parameter]]) -> str:
+def commented(text: str, kind: Any) -> str:
     """Return YAML text in block style with unit and meaning behind each declared key.
 
     Args:
-        text: one mapping, whose values are numbers, lists or mappings of declared keys.
-        sections: declared parameters by the top-level key that holds them; "" for the top level.
+        text: one mapping, as `read` makes the dataclass of it.
+        kind: the dataclass; its fields may be others, or tuples of them.
     """
+    sections = {"": declarations(kind)}
+    for key, held in get_type_hints(kind).items():
+        for each in filter(is_dataclass, (held, *get_args(held))):
+            sections[key] = declarations(each)
     section, lines = "", list[str]()
     for line in text.splitlines():
         match = re.match(r"([- ]*)(\w+):", line)
@@ -178,20 +188,6 @@ def commented(text: str, sections: Mapping[str, Mapping[str, Parameter]]) -> str
     return "\n".join([*lines, ""])
 
 
-def field_names(kind: Any) -> set[str]:
-    """Return the names of a dataclass's fields."""
-    return {item.name for item in dataclasses.fields(kind)}
-
-
-def refuse_unknown(content: Mapping[str, Any], known: set[str], where: str) -> None:
-    """Raise a `LimbError` that names a key that is not known, and those that are."""
-    unknown = sorted(str(key) for key in content if key not in known)
-    if unknown:
-        raise LimbError(
-            f"unknown key {where}{unknown[0]}: the keys here are {', '.join(sorted(known))}"
-        )
-
-
 def number(value: object, key: str) -> float:
     """Return a number of a limb file; raise a `LimbError` that names its key if it is none."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
@@ -200,24 +196,40 @@ def number(value: object, key: str) -> float:
     return float(value)
 
 
-def from_mapping(kind: Any, content: object, where: str, retired: Collection[str] = ()) -> Any:
-    """Return a dataclass from the mapping of a limb file, without its retired keys.
+def read(kind: Any, content: object, where: str = "") -> Any:
+    """Return a dataclass from the mapping of a limb file; fields that it lacks have their defaults.
 
-    Its fields are numbers, but for a ``name``.
+    Its fields are numbers, texts, free mappings, other such dataclasses, or tuples of these. Keys
+    that older files have are in its ``RETIRED``.
 
     Raises:
-        LimbError: no mapping, a key is missing, unknown or no number; ``where`` is named.
+        LimbError: no mapping, a key is missing, unknown or of another type; ``where`` is named.
     """
     if not isinstance(content, Mapping):
         raise LimbError(f"{where} must be a mapping of keys, got {content!r}")
-    content = {key: v for key, v in content.items() if key not in retired}
-    refuse_unknown(content, field_names(kind), f"{where}.")
-    for item in dataclasses.fields(kind):
-        if item.default is dataclasses.MISSING and item.name not in content:
-            raise LimbError(f"{where}.{item.name} is missing")
-    return kind(
-        **{
-            key: str(value) if key == "name" else number(value, f"{where}.{key}")
-            for key, value in content.items()
-        }
-    )
+    above, known = f"{where}." if where else "", {item.name: item for item in fields(kind)}
+    given = {str(key): v for key, v in content.items() if key not in getattr(kind, "RETIRED", ())}
+    for key in sorted(given.keys() - known):
+        raise LimbError(f"unknown key {above}{key}: the keys here are {', '.join(sorted(known))}")
+    for key, item in known.items():
+        if key not in given and item.default is MISSING and item.default_factory is MISSING:
+            raise LimbError(f"{above}{key} is missing")
+    types = get_type_hints(kind)
+    return kind(**{key: _value(types[key], value, above + key) for key, value in given.items()})
+
+
+def _value(kind: Any, value: Any, where: str) -> Any:
+    """Return a value of a limb file as a field of this type holds it."""
+    if kind is float:
+        return number(value, where)
+    if kind is str:
+        return str(value)
+    if is_dataclass(kind):
+        return read(kind, {} if value is None else value, where)
+    if get_origin(kind) is not tuple:
+        return dict(value or {})
+    inner, several = get_args(kind)[0], value or ()
+    if not isinstance(several, Sequence) or isinstance(several, str):
+        what = "numbers" if inner is float else "mappings, one an entry"
+        raise LimbError(f"{where} must be a list of {what}, got {value!r}")
+    return tuple(_value(inner, item, f"{where}[{index}]") for index, item in enumerate(several))

@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -20,26 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from der_planner.files import read_yaml, write_whole, yaml_text
-from der_planner.limb.declaration import (
-    LimbError,
-    Parameter,
-    check,
-    commented,
-    declarations,
-    field_names,
-    from_mapping,
-    number,
-    parameter,
-    refuse_unknown,
-)
-from der_planner.limb.loads import (
-    BEYOND_THE_TIP,
-    PAYLOAD,
-    Load,
-    PointMass,
-    gravity_of,
-    mounting_of,
-)
+from der_planner.limb.declaration import LimbError, check, commented, effect, parameter, read
+from der_planner.limb.loads import BEYOND_THE_TIP, PAYLOAD, Load, PointMass, gravity_of, mounting_of
 from der_planner.limb.parameters import CalibratedRange, Pneumatics, Segment
 
 SCHEMA_VERSION = 1
@@ -66,12 +48,10 @@ class Limb:
     name: str
     segments: tuple[Segment, ...]
     pneumatics: Pneumatics
-    connector_length: float = parameter(
+    connector_length: float = effect(
         "m",
         "straight passive piece between two segments",
         "measure it; 0 lets the rod's mesh choose one edge that belongs to neither segment",
-        default=0.0,
-        interval="[0, inf)",
     )
     gravity: tuple[float, float, float] = parameter(
         "m/s²",
@@ -84,12 +64,10 @@ class Limb:
     calibrated: CalibratedRange = field(default_factory=CalibratedRange)
     provenance: Mapping[str, Any] = field(default_factory=dict)
     pcc_segments: tuple[Segment, ...] = ()
-    base_length: float = parameter(
+    base_length: float = effect(
         "m",
         "straight passive piece between the clamp and the first segment",
         "measure it; the calibration corrects it by the tip",
-        default=0.0,
-        interval="[0, inf)",
     )
     masses: tuple[PointMass, ...] = ()
 
@@ -194,15 +172,23 @@ class Limb:
                 f"{mass:g} kg are {factor:.4g} times what the limb file says, {self.mass:.3g} kg: "
                 "give kg"
             )
+        return self.scaled("mass_per_length", factor)
 
-        def scaled(segments: tuple[Segment, ...]) -> tuple[Segment, ...]:
-            return tuple(
-                dataclasses.replace(s, mass_per_length=factor * s.mass_per_length) for s in segments
+    def scaled(self, name: str, factor: float, segment: int | None = None) -> Limb:
+        """Return the limb with a parameter of one segment, or of all, times a factor.
+
+        Both models get it, where the calibration gave the arcs numbers of their own.
+        """
+        changed: dict[str, Any] = {
+            key: tuple(
+                dataclasses.replace(each, **{name: factor * getattr(each, name)})
+                if segment in (None, place)
+                else each
+                for place, each in enumerate(getattr(self, key))
             )
-
-        return dataclasses.replace(
-            self, segments=scaled(self.segments), pcc_segments=scaled(self.pcc_segments)
-        )
+            for key in ("segments", "pcc_segments")
+        }
+        return dataclasses.replace(self, **changed)
 
     def carrying(self, payload: float, at: float | None = None, name: str = PAYLOAD) -> Limb:
         """Return the limb with one more mass.
@@ -308,67 +294,19 @@ class Limb:
         """
         if not isinstance(content, Mapping):
             raise LimbError(f"expected a mapping of keys, got {type(content).__name__}")
-        version = content.get("schema_version")
+        body = {"name": "limb", **content}
+        version = body.pop("schema_version", None)
         if version != SCHEMA_VERSION:
             raise LimbError(f"schema_version is {version!r}: this program reads {SCHEMA_VERSION}")
-        refuse_unknown(content, {"schema_version", *field_names(cls)}, "")
-        calibrated = content.get("calibrated") or {}
-        refuse_unknown(calibrated, field_names(CalibratedRange), "calibrated.")
-        return cls(
-            name=str(content.get("name", "limb")),
-            segments=_entries(Segment, content.get("segments"), "segments"),
-            pcc_segments=_entries(Segment, content.get("pcc_segments") or [], "pcc_segments"),
-            pneumatics=from_mapping(Pneumatics, content.get("pneumatics"), "pneumatics", _RETIRED),
-            connector_length=number(content.get("connector_length", 0.0), "connector_length"),
-            base_length=number(content.get("base_length", 0.0), "base_length"),
-            gravity=_numbers(content.get("gravity", (0.0, 0.0, 0.0)), "gravity"),
-            masses=_entries(PointMass, content.get("masses") or [], "masses"),
-            calibrated=CalibratedRange(
-                **{key: _numbers(value, f"calibrated.{key}") for key, value in calibrated.items()}
-            ),
-            provenance=dict(content.get("provenance") or {}),
-        )
+        limb: Limb = read(cls, body)
+        return limb
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the content of a limb file, which `from_mapping` makes an equal limb of."""
-        body: dict[str, Any] = {"schema_version": SCHEMA_VERSION, **dataclasses.asdict(self)}
-        for key in ("gravity", "segments", "pcc_segments", "masses"):
-            body[key] = list(body[key])
-        body["calibrated"] = {key: list(value) for key, value in body["calibrated"].items()}
-        body["provenance"] = dict(self.provenance)
-        return body
+        return {"schema_version": SCHEMA_VERSION, **dataclasses.asdict(self)}
 
     def to_yaml(self, path: str | Path) -> None:
         """Write a limb file that `from_yaml` reads back as an equal limb, whole or not at all."""
         text = yaml_text(self.to_mapping(), allow_unicode=True)
         head = "# A limb, in SI units. How to choose each: the site, python3 scripts/docs.py\n"
-        write_whole(path, head + commented(text, sections()))
-
-
-def sections() -> dict[str, dict[str, Parameter]]:
-    """Return the declared parameters by the key of a limb file that holds them; "": itself."""
-    return {
-        "": declarations(Limb),
-        "segments": declarations(Segment),
-        "pcc_segments": declarations(Segment),
-        "pneumatics": declarations(Pneumatics),
-        "calibrated": declarations(CalibratedRange),
-        "masses": declarations(PointMass),
-    }
-
-
-_RETIRED = ("fill_rate", "minimum_supply")
-"""Keys of `pneumatics` in older limb files that nothing reads any more."""
-
-
-def _entries(kind: Any, content: object, key: str) -> tuple[Any, ...]:
-    """Return the dataclasses of a list of mappings in a limb file."""
-    if not isinstance(content, Sequence) or isinstance(content, str):
-        raise LimbError(f"{key} must be a list of mappings, one an entry, got {content!r}")
-    return tuple(from_mapping(kind, item, f"{key}[{index}]") for index, item in enumerate(content))
-
-
-def _numbers(value: object, key: str) -> tuple[Any, ...]:
-    if not isinstance(value, Sequence) or isinstance(value, str):
-        raise LimbError(f"{key} must be a list of numbers, got {value!r}")
-    return tuple(number(item, f"{key}[{index}]") for index, item in enumerate(value))
+        write_whole(path, head + commented(text, Limb))

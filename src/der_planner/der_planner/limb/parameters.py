@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
-from der_planner.limb.declaration import Term, parameter
+from der_planner.limb.declaration import Term, effect, parameter, positive, signed_effect
 
 VENT_REFERENCE = 10e3
 """Gauge pressure [Pa] for which `Pneumatics.vent_rate` is given."""
@@ -32,34 +33,30 @@ class Segment:
         "measure what bends; the calibration corrects it by the tip",
         interval="(0, 5]",
     )
-    bending_stiffness: float = parameter(
+    bending_stiffness: float = positive(
         "N·m²",
         "bending stiffness EI",
         "hold it level, hang a small force F on its end: EI = F L³ / (3 · extra deflection)",
-        interval="(0, inf)",
         fit=Term(
             *("log_stiffness", "-", 0.2, -1.2, 1.2, 0.3, "dynamics"),
             relative=True,
             kept=True,
         ),
     )
-    axial_stiffness: float = parameter(
+    axial_stiffness: float = positive(
         "N",
         "stretching stiffness EA",
         "pull it: force · length / extension; its value hardly matters far above EI / L²",
-        interval="(0, inf)",
     )
-    torsional_stiffness: float = parameter(
+    torsional_stiffness: float = positive(
         "N·m²",
         "twisting stiffness GJ, which only the rod in space reads",
         "a round section of incompressible rubber has 2/3 EI",
-        interval="(0, inf)",
     )
-    mass_per_length: float = parameter(
+    mass_per_length: float = positive(
         "kg/m",
         "mass per length",
         "weigh it, divide by its length",
-        interval="(0, inf)",
         fit=Term(*("log_mass", "-", 0.1, -1.2, 1.2, 0.3, "mass"), relative=True, kept=True),
     )
     damping: float = parameter(
@@ -74,48 +71,42 @@ class Segment:
             kept=True,
         ),
     )
-    moment_gain: float = parameter(
+    moment_gain: float = positive(
         "N·m/Pa",
         "bending moment per differential pressure G",
         "bend angle at a slow pressure / pressure · EI / L; leave it to the calibration",
-        interval="(0, inf)",
         fit=Term(
             *("gain", "rad/Pa", 1.2, 0.12, 12.0, math.inf, "linear"),
             per_limit=-1,
             per={"length": 1, "bending_stiffness": -1},
         ),
     )
-    rest_curvature: float = parameter(
+    rest_curvature: float = signed_effect(
         "1/m",
         "signed curvature at zero differential pressure, positive toward +y",
         "bend angle at rest / length; leave it to the calibration",
-        default=0.0,
         fit=Term(*("rest_angle", "rad", 0.02, -0.6, 0.6, REST_SPREAD, "linear"), per={"length": 1}),
     )
-    cubic_stiffness: float = parameter(
+    cubic_stiffness: float = signed_effect(
         "N·m⁴",
         "k3 in moment = EI (κ − κ̄) + k3 (κ − κ̄)³",
         "0 unless large bends fall short of small ones in proportion; calibration",
-        default=0.0,
         fit=Term(
             *("cubic", "1/rad²", 0.05, -0.2, 0.5, 0.05, "cubic"),
             per={"bending_stiffness": -1, "length": -2},
         ),
     )
-    material_damping: float = parameter(
+    material_damping: float = effect(
         "s",
         "Kelvin-Voigt time τ in moment = EI (κ + τ κ̇)",
         "0.01 takes away ringing that a real limb does not show; calibration with fast motion",
-        default=0.0,
-        interval="[0, inf)",
         fit=Term(*("material_damping", "s", 0.01, 0.0, 0.1, 0.02, "dynamics"), kept=True),
     )
-    swing_inertia: float = parameter(
+    swing_inertia: float = positive(
         "-",
         "mass that resists acceleration over mass that weighs",
         "1; less stands for friction, which stiffens small fast strokes; calibration",
         default=1.0,
-        interval="(0, inf)",
         fit=Term(
             *("log_inertia", "-", 0.1, -0.7, 0.7, 0.2, "dynamics"),
             shared=True,
@@ -123,29 +114,25 @@ class Segment:
             kept=True,
         ),
     )
-    gain_asymmetry: float = parameter(
+    gain_asymmetry: float = signed_effect(
         "-",
         "relative gain of the left over the mean of both chambers",
         "(left − right) / (left + right) of the bend angles by equal pressures; calibration",
-        default=0.0,
         interval="(-1, 1)",
         fit=Term("gain_asymmetry", "-", 0.03, -0.4, 0.4, 0.1, "asymmetry"),
     )
-    pressure_stiffening: float = parameter(
+    pressure_stiffening: float = signed_effect(
         "1/Pa",
         "relative growth of the stiffness per |differential pressure|",
         "0, or from the calibration, which hardly tells it from cubic_stiffness",
-        default=0.0,
         fit=Term(
             "pressure_stiffening", "1/Pa", 0.072, -0.48, 0.72, 0.24, "stiffening", per_limit=-1
         ),
     )
-    friction_moment: float = parameter(
+    friction_moment: float = effect(
         "N·m",
         "saturation of a Dahl friction element",
         "half of the pressure between the branches of a slow loop · moment_gain; calibration",
-        default=0.0,
-        interval="[0, inf)",
         fit=Term(
             *("friction_pressure", "Pa", 0.0125, 0.0, 1 / 6, 1 / 30, "friction"),
             per={"moment_gain": -1},
@@ -153,12 +140,10 @@ class Segment:
             per_limit=1,
         ),
     )
-    friction_curvature: float = parameter(
+    friction_curvature: float = effect(
         "1/m",
         "change of curvature over which friction turns round",
         "bend angle in which a reversal has made 63 % of its way / length; calibration",
-        default=0.0,
-        interval="[0, inf)",
         needs="friction_moment",
         fit=Term(
             *("friction_angle", "rad", 0.1, 0.02, 0.8, 0.1, "friction"),
@@ -166,12 +151,10 @@ class Segment:
             start=0.1,
         ),
     )
-    creep_stiffness: float = parameter(
+    creep_stiffness: float = effect(
         "N·m²",
         "stiffness of a Maxwell element beside EI",
         "EI · relative growth of the bend angle while a pressure is held; calibration",
-        default=0.0,
-        interval="[0, inf)",
         fit=Term(
             *("creep_pressure", "Pa/rad", 1 / 48, 0.0, 0.625, 1 / 12, "creep"),
             per={"moment_gain": -1, "length": -1},
@@ -179,28 +162,24 @@ class Segment:
             per_limit=1,
         ),
     )
-    creep_time: float = parameter(
+    creep_time: float = effect(
         "s",
         "relaxation time of the Maxwell element",
         "time in which that growth has come to 63 %; calibration",
-        default=0.0,
-        interval="[0, inf)",
         needs="creep_stiffness",
         fit=Term("creep_time", "s", 15.0, 3.0, 120.0, 15.0, "creep", start=15.0),
     )
-    coupling_before: float = parameter(
+    coupling_before: float = signed_effect(
         "-",
         "moment by the pressure of the segment before, over that of its own: tubes, walls",
         "pressurise the segment before alone: bend here / bend there, if alike; calibration",
-        default=0.0,
         interval="(-0.5, 0.5)",
         fit=Term("coupling_before", "-", 0.03, -0.4, 0.4, 0.05, "coupling", neighbour=-1),
     )
-    coupling_after: float = parameter(
+    coupling_after: float = signed_effect(
         "-",
         "moment by the pressure of the segment after, over that of its own: tubes, walls",
         "pressurise the segment after alone: bend here / bend there, if alike; calibration",
-        default=0.0,
         interval="(-0.5, 0.5)",
         fit=Term("coupling_after", "-", 0.03, -0.4, 0.4, 0.05, "coupling", neighbour=1),
     )
@@ -215,44 +194,38 @@ class Segment:
 class Pneumatics:
     """How a commanded differential pressure becomes a measured one, and what may be asked for."""
 
-    pressure_limit: float = parameter(
+    RETIRED: ClassVar = ("fill_rate", "minimum_supply")
+    """Keys in older limb files that nothing reads any more."""
+
+    pressure_limit: float = positive(
         "Pa",
         "largest |differential pressure| of a plan",
         "what the chambers bear for good, at most the driver's pressure_limit",
-        interval="(0, inf)",
     )
-    slew_limit: float = parameter(
+    slew_limit: float = positive(
         "Pa/s",
         "largest |change of a commanded differential pressure| per second",
         "at most the fill rate that the calibration's report names, and the driver's limit",
-        interval="(0, inf)",
     )
-    time_constant: float = parameter(
+    time_constant: float = positive(
         "s",
         "first-order lag from command to chamber",
         "from the calibration",
-        interval="(0, inf)",
     )
-    delay: float = parameter(
+    delay: float = effect(
         "s",
         "dead time from command to the first change in the chamber",
         "from the calibration",
-        default=0.0,
-        interval="[0, inf)",
     )
-    vent_time_constant: float = parameter(
+    vent_time_constant: float = effect(
         "s",
         "lag while |differential pressure| falls; 0: as time_constant",
         "from the calibration",
-        default=0.0,
-        interval="[0, inf)",
     )
-    vent_rate: float = parameter(
+    vent_rate: float = effect(
         "Pa/s",
         "fall of a chamber at 10 kPa with its outlet wide open; 0: no limit",
         "from the calibration, or the steepest fall after a step from 10 kPa to 0",
-        default=0.0,
-        interval="[0, inf)",
     )
     vent_exponent: float = parameter(
         "-",
@@ -262,12 +235,11 @@ class Pneumatics:
         interval="(0, 1]",
     )
 
-    vent_lag_exponent: float = parameter(
+    vent_lag_exponent: float = signed_effect(
         "-",
         "vent_time_constant is that at 10 kPa and falls with this power of the chamber's gauge "
         "pressure; 0: the same at all pressures",
         "as vent_exponent for a valve that opens in proportion to its error; calibration",
-        default=0.0,
         interval="[0, 1]",
     )
 

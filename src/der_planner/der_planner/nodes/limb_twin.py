@@ -71,19 +71,16 @@ class LimbTwinNode(Node):
         gravity = read("gravity", [0.0, 0.0, 0.0], "acceleration in limb_base: x, y, z [m/s^2]")
         masses = read("masses", [0.0], "that the limb carries [kg]")
         places = read("masses_at", [0.0], "where each mass sits, along the limb from its clamp [m]")
-        if len(gravity) != 3:
-            raise TwinError(f"parameter 'gravity' must be three numbers in m/s², got {gravity}")
         if len(masses) != len(places):
             raise TwinError(
                 f"parameters 'masses' and 'masses_at' must be of one length, got {len(masses)} and "
                 f"{len(places)}"
             )
-        x, y, z = map(float, gravity)
         both = zip(masses, places, strict=True)
         carried = [PointMass(float(at), float(mass)) for mass, at in both]
         round_things = "round things in the limb's way: x, y, radius of each [m]; 0: nothing"
         pegs = read("pegs", [0.0], round_things)
-        twin = LimbTwin(seed, run, gravity=(x, y, z), masses=carried)
+        twin = LimbTwin(seed, run, gravity=tuple(map(float, gravity)), masses=carried)
         if any(pegs):
             if len(pegs) % 3:
                 raise TwinError(f"parameter 'pegs' must be x, y, radius of each, got {pegs}")

@@ -13,13 +13,7 @@ from rclpy.node import Node
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
-from der_msgs.msg import (
-    LimbContact,
-    LimbEstimate,
-    PressurePlan,
-    PressureSetpoint,
-    PressureState,
-)
+from der_msgs.msg import LimbContact, LimbEstimate, PressurePlan, PressureSetpoint, PressureState
 from der_planner.arrays import Array, interpolate
 from der_planner.control.force import Touch
 from der_planner.control.knowledge import Estimate

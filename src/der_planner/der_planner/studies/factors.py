@@ -87,26 +87,27 @@ class Factor:
         raise StudyError(f"{where} must be {self.range}, got {value!r}")
 
 
+def _choice(
+    text: str, tasks: tuple[str, ...], choices: tuple[str, ...], degrees: bool = False
+) -> Factor:
+    """Return a factor that has a name for a value; the first one is the default."""
+    return Factor("-", text, tasks, choices[0], choices=choices, degrees=degrees)
+
+
 FACTORS: dict[str, Factor] = {
     "seed": Factor("-", "draws the twin's hardware", TWIN, 1, 0, 2**31 - 1000),
     "motion": Factor("-", "named motion", PLANNED, "same_direction", choices=NAMES),
-    "model": Factor("-", "planned with", PLANNED, "der", choices=tuple(METHODS)),
-    "method": Factor(
-        "-",
-        "of planning, the same for both models; best: optimal",
-        PLANNED,
-        "best",
-        choices=("best", *METHODS["der"]),
+    "model": _choice("planned with", PLANNED, tuple(METHODS)),
+    "method": _choice(
+        "of planning, the same for both models; best: optimal", PLANNED, ("best", *METHODS["der"])
     ),
     "amplitude": Factor("rad", "largest bend of a segment", PLANNED, DEFAULT_AMPLITUDE, 0.01, 2.0),
     "period": Factor("s", "of one cycle", PLANNED, DEFAULT_PERIOD, 0.5, 600.0),
     "cycles": Factor("-", "of the motion", PLANNED, DEFAULT_CYCLES, 1, 1000),
-    "calibration": Factor(
-        "-",
+    "calibration": _choice(
         "run that the twin is calibrated with: 90 s, 200 s, or none (the default limb is used)",
         TWIN,
-        "quick",
-        choices=("quick", "long", "none"),
+        ("quick", "long", "none"),
     ),
     "tag_noise": Factor(
         "-",
@@ -116,12 +117,10 @@ FACTORS: dict[str, Factor] = {
         0.0,
         100.0,
     ),
-    "mounting": Factor(
-        "-",
+    "mounting": _choice(
         "how the limb is mounted, when it is calibrated and when it plays",
         EVERY,
-        "horizontal",
-        choices=tuple(MOUNTINGS),
+        tuple(MOUNTINGS),
         degrees=True,
     ),
     "payload": Factor("kg", "carried while it plays, not when calibrated", PLANNED, 0.0, 0.0, 10.0),
@@ -131,19 +130,11 @@ FACTORS: dict[str, Factor] = {
     "learning_runs": Factor(
         "-", "earlier runs of the motion that the plan has learned from (der)", (RUN,), 0, 0, 100
     ),
-    "feedback": Factor(
-        "-",
-        "whether commands are revised while the limb moves",
-        (RUN,),
-        "off",
-        choices=("off", "on"),
-    ),
+    "feedback": _choice("whether commands are revised while the limb moves", (RUN,), ("off", "on")),
     "latency": Factor(
         "s", "from a picture to what was seen on it, for feedback", (RUN,), 0.07, 0.0, 2.0
     ),
-    "payload_known": Factor(
-        "-", "whether the plan reckons with the payload", PLANNED, "yes", choices=("yes", "no")
-    ),
+    "payload_known": _choice("whether the plan reckons with the payload", PLANNED, ("yes", "no")),
 }
 _NOT_VARIED = ("pressure_limit", "slew_limit")
 """Limits are not errors of a model."""

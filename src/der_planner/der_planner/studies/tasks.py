@@ -346,28 +346,14 @@ TASKS = {
 
 
 def with_errors(limb: Limb, row: Mapping[str, Any]) -> Limb:
-    """Return a limb whose parameters are larger by the row's relative errors (``error.NAME``).
-
-    Both models get them, where the calibration gave the arcs numbers of their own.
-    """
-    for name, value in row.items():
+    """Return a limb whose parameters are larger by the row's relative errors (``error.NAME``)."""
+    for name, error in row.items():
         if not name.startswith(ERROR):
             continue
-        parameter, place = split_error(name)
+        parameter, segment = split_error(name)
         if parameter in declarations(Pneumatics):
-            limb = replace(limb, pneumatics=_larger(limb.pneumatics, parameter, value))
-            continue
-        changed: dict[str, Any] = {
-            kind: tuple(
-                _larger(each, parameter, value) if place in (None, index) else each
-                for index, each in enumerate(getattr(limb, kind))
-            )
-            for kind in ("segments", "pcc_segments")
-        }
-        limb = replace(limb, **changed)
+            value = getattr(limb.pneumatics, parameter) * (1.0 + error)
+            limb = replace(limb, pneumatics=replace(limb.pneumatics, **{parameter: value}))
+        else:
+            limb = limb.scaled(parameter, 1.0 + error, segment)
     return limb
-
-
-def _larger(part: Any, parameter: str, error: float) -> Any:
-    """Return a segment, or the air, with a parameter larger by a relative error."""
-    return replace(part, **{parameter: getattr(part, parameter) * (1.0 + error)})
