@@ -72,13 +72,14 @@ LAYERS = {
     "planning": 4,
     "bags": 4,
     "results": 5,
-    "identification": 5,
-    "control": 6,
-    "experiment": 7,
-    "page": 7,
-    "nodes": 7,
-    "studies": 8,
-    "commands": 9,
+    "estimation": 5,
+    "identification": 6,
+    "control": 7,
+    "experiment": 8,
+    "page": 8,
+    "nodes": 8,
+    "studies": 9,
+    "commands": 10,
 }
 """Place of each part in the order; an import must go to a lower one, or stay inside its part."""
 

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from limbs import with_segments
 
-from der_planner.control.force import untouched
-from der_planner.control.free_level import FreeLevel, Lacking
-from der_planner.control.knowledge import Knowledge
 from der_planner.control.reaction import Reaction
-from der_planner.control.touch import TouchSense
+from der_planner.estimation.force import untouched
+from der_planner.estimation.free_level import FreeLevel, Lacking
+from der_planner.estimation.knowledge import Knowledge
+from der_planner.estimation.touch import TouchSense
 from der_planner.limb import Limb
 from der_planner.model import RodModel
 from der_planner.model.compliance import compliance
@@ -102,6 +102,18 @@ def test_a_force_is_found_with_its_place(model, node, pushed):
     axes = frame(model, node, felt.bend_angles)
     doubt = float(np.sqrt((axes.T @ touch.force_covariance @ axes)[1, 1]))
     assert abs((apart @ axes)[1]) < max(0.15 * abs((force @ axes)[1]), doubt)
+
+
+def test_a_limb_file_that_knows_the_free_level_makes_a_first_run_feel_more(model):
+    covered = replace(LIMB.calibrated, differential_pressure=(1e4, 1e4))
+    bare = replace(LIMB, calibrated=covered)
+    known = replace(LIMB, calibrated=replace(covered, free_level=calibrated().told()))
+    felt = lacking(model, {15: (0.0, -0.2)})
+    less, more = (TouchSense(model, FreeLevel(limb)).look(felt) for limb in (bare, known))
+    assert more.distance > 1.5 * less.distance
+    # Mounted otherwise it may lack something else.
+    other, first = (FreeLevel(limb.mounted("sideways")).told() for limb in (known, bare))
+    assert other == first
 
 
 def test_what_cannot_be_told_is_not_told(model):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from limbs import of_pressures, with_segments
 
+from der_planner.estimation.free_level import FreeLevel
 from der_planner.identification import CalibrationLog, LogError, check, fit, predict
 from der_planner.identification.bends import NODES, BendFit, Predicted, follow
 from der_planner.identification.excitation import calibration_run, steps, sweep, waves
@@ -154,6 +155,18 @@ def test_a_limb_of_other_pressures_is_found_alike(log, fitted, factor):
     np.testing.assert_allclose(values_of(limb), expected, rtol=0.01, atol=1e-3)
     assert report.residual == pytest.approx(fitted[1].residual, rel=1e-3)
     assert report.warnings == fitted[1].warnings
+
+
+def test_a_log_tells_what_the_model_lacks_of_a_free_limb(fitted):
+    limb, _ = fitted
+    of = replace(limb.calibrated, free_level=())
+    told, first = (
+        np.array(FreeLevel(each).told()) for each in (limb, replace(limb, calibrated=of))
+    )
+    places, deviations = np.arange(24).reshape(4, 6), np.arange(24, 48).reshape(4, 6)
+    by_pressure = places[:2, :2], deviations[:2, :2]
+    assert np.abs(told[by_pressure[0]]).max() < 0.02
+    assert np.all(told[by_pressure[1]] < 0.5 * first[by_pressure[1]])
 
 
 def test_a_limb_that_fits_passes_the_check_and_a_changed_one_does_not(fitted):

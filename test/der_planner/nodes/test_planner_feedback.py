@@ -10,7 +10,7 @@ from visualization_msgs.msg import Marker
 
 from der_msgs.msg import LimbState
 from der_planner.control import Feedback
-from der_planner.control.force import untouched
+from der_planner.estimation.force import untouched
 from der_planner.limb import Limb
 from der_planner.nodes.planner_feedback import Corrector, _Corrected
 from der_planner.nodes.planner_topics import PlannerPublishers

@@ -18,7 +18,7 @@ import numpy as np
 
 from der_planner.arrays import Array
 from der_planner.commands.learn import FAILURES, add_plan_options, in_hindsight, plan_of
-from der_planner.control.hindsight import Smoothed, smooth
+from der_planner.estimation.hindsight import Smoothed, smooth
 from der_planner.experiment.console import check_file, command
 from der_planner.results import RunSeries, load_run
 

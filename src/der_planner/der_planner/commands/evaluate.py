@@ -17,7 +17,7 @@ import argparse
 from pathlib import Path
 
 from der_planner.commands.learn import FAILURES, add_plan_options, in_hindsight, plan_of
-from der_planner.control.hindsight import touches
+from der_planner.estimation.hindsight import touches
 from der_planner.experiment.console import Progress, check_file, check_folder, command
 from der_planner.results import (
     RunSeries,

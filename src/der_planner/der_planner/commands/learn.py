@@ -20,7 +20,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from der_planner.control import Learner, LearningError
-from der_planner.control.hindsight import Filmed, touches
+from der_planner.estimation.hindsight import Filmed, touches
 from der_planner.experiment.console import check_file, command
 from der_planner.limb import Limb, LimbError, Load
 from der_planner.planning import Motion, Obstacles, Plan, PlanningError, plan

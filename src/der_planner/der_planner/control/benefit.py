@@ -25,7 +25,7 @@ import math
 import numpy as np
 
 from der_planner.arrays import Array
-from der_planner.control.nominal import Nominal
+from der_planner.estimation.nominal import Nominal
 from der_planner.model import CONTROL_PERIOD
 
 _SMOOTH = 0.3

@@ -21,14 +21,14 @@ from threadpoolctl import ThreadpoolController
 
 from der_planner.arrays import Array
 from der_planner.control.benefit import Benefit
-from der_planner.control.estimation import Estimator
-from der_planner.control.force import Touch
 from der_planner.control.horizon import Horizon
-from der_planner.control.knowledge import Estimate
-from der_planner.control.nominal import ChamberLog, Nominal
 from der_planner.control.reaction import Kind, Reaction
 from der_planner.control.supervisor import Supervisor, Warned
-from der_planner.control.touch import TouchSense
+from der_planner.estimation.estimator import Estimator
+from der_planner.estimation.force import Touch
+from der_planner.estimation.knowledge import Estimate
+from der_planner.estimation.nominal import ChamberLog, Nominal
+from der_planner.estimation.touch import TouchSense
 from der_planner.limb.plausible import TOO_SMALL, impossible
 from der_planner.model import CONTROL_PERIOD, STEPS
 from der_planner.model.commands import within_limits

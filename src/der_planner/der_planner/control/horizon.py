@@ -1,8 +1,8 @@
 """The receding horizon: corrections of the coming commands that bring the tip back to r̄(t).
 
 From the estimate at the instant of the next command on, the linear system of
-`der_planner.control.nominal` is rolled forward under the commands that would be sent without a new
-correction. It begins with the limb's bends, and with the plan's rates: a command takes effect some
+`der_planner.estimation.nominal` is rolled forward under the commands that would be sent without a
+new correction. It begins with the limb's bends, and with the plan's rates: a command takes effect some
 0.2 s after the picture that it answers, and on a limb whose frequency is not what the model says,
 a swing is by then in another phase than expected and would be driven. Swings are left to the
 limb's own damping. The corrections c (W, M), added to the plan's commands, then minimise
@@ -27,8 +27,8 @@ from typing import NamedTuple
 import numpy as np
 
 from der_planner.arrays import Array
-from der_planner.control.knowledge import Knowledge
-from der_planner.control.nominal import ChamberLog, Nominal
+from der_planner.estimation.knowledge import Knowledge
+from der_planner.estimation.nominal import ChamberLog, Nominal
 from der_planner.model import CONTROL_PERIOD, STEPS
 from der_planner.model.air import Chambers
 from der_planner.model.commands import within_limits

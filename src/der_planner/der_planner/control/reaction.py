@@ -26,7 +26,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from der_planner.arrays import Array
-from der_planner.control.force import Touch
+from der_planner.estimation.force import Touch
 from der_planner.model import CONTROL_PERIOD, RodModel
 
 Kind = Literal["warn", "hold", "yield", "vent"]

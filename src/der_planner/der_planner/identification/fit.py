@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from der_planner.arrays import Array
+from der_planner.estimation.hindsight import Filmed, free_level
 from der_planner.identification.air import AirFit, fit_air
 from der_planner.identification.bends import MOST_FITS, NODES, BendFit, Predicted
 from der_planner.identification.least_squares import Rows
@@ -48,7 +49,7 @@ from der_planner.identification.told import (
     untold_stiffness,
 )
 from der_planner.limb import CalibratedRange, Limb
-from der_planner.model import ArcModel, Material, RodModel
+from der_planner.model import CONTROL_PERIOD, ArcModel, Material, RodModel
 from der_planner.planning.loads import nearly_buckling
 
 MOST_PASSES = 4
@@ -124,6 +125,18 @@ def fit(
     return _fit(limb, log, groups, longest_gap, weight)
 
 
+def _with_free_level(limb: Limb, log: CalibrationLog) -> Limb:
+    """Return the limb with what the log tells of the free level, by which feedback feels touch."""
+    grid, time = log.resampled(CONTROL_PERIOD), log.time - log.time[0]
+    filmed = Filmed(time, log.measured_differential, time, log.bend_angles, log.tip)
+    commands = np.nan_to_num(grid.commanded_differential)
+    try:
+        told = free_level(limb, grid.time - grid.time[0], commands, filmed)
+    except ValueError:  # a log without tips
+        return limb
+    return replace(limb, calibrated=replace(limb.calibrated, free_level=told))
+
+
 def _fit(
     limb: Limb,
     log: CalibrationLog,
@@ -177,6 +190,7 @@ def _fit(
     pcc_residual = np.full(limb.segment_count, np.nan)
     if limb.weighs_in_plane or any(term.group == "dynamics" for term in fitted.free.terms):
         found, pcc_residual = _with_arcs(found, fitted, prepared, warnings)
+    found = _with_free_level(found, log)
     return found, FitReport(
         limb=found,
         source=log.source,

@@ -267,6 +267,12 @@ class CalibratedRange:
         default=(),
         interval="[0, inf)",
     )
+    free_level: tuple[float, ...] = parameter(
+        "-",
+        "what the model lacks while nothing touches the limb: means and deviations",
+        "the calibration writes it; without it feedback feels less in its first run",
+        default=(),
+    )
     gravity: tuple[float, ...] = parameter(
         "m/s²",
         "gravity for which the limb's numbers were found; empty: the limb's gravity",

@@ -20,7 +20,7 @@ from std_srvs.srv import Trigger
 from der_msgs.msg import LimbState, PressureState
 from der_planner.arrays import Array
 from der_planner.control.feedback import Feedback
-from der_planner.control.force import untouched
+from der_planner.estimation.force import untouched
 from der_planner.limb import Limb
 from der_planner.nodes.planner_topics import PlannerPublishers
 from der_planner.planning import METHODS, Motion, plan

@@ -15,8 +15,8 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from der_msgs.msg import LimbContact, LimbEstimate, PressurePlan, PressureSetpoint, PressureState
 from der_planner.arrays import Array, interpolate
-from der_planner.control.force import Touch
-from der_planner.control.knowledge import Estimate
+from der_planner.estimation.force import Touch
+from der_planner.estimation.knowledge import Estimate
 from der_planner.planning import Plan
 from der_planner.planning.streaming import GRID, Ending, Schedule
 from limb_interfaces import qos, topics

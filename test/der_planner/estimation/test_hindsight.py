@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from link_chain import TIP_NOISE, LinkChain
 
-from der_planner.control.hindsight import Filmed, Smoothed, smooth
-from der_planner.control.nominal import STEP, ChamberLog, Nominal
+from der_planner.estimation.hindsight import Filmed, Smoothed, smooth
+from der_planner.estimation.nominal import STEP, ChamberLog, Nominal
 from der_planner.limb import Limb
 from der_planner.planning import Motion, Plan, plan
 

@@ -1,9 +1,9 @@
 """Touch: what pressures, loads and friction do not explain of the shape is a force.
 
-`der_planner.control.force` says which force, and where it acts. Without contact what a model lacks
-is not zero either (`der_planner.control.free_level`). A distance from that free level which noise
-would pass once in an hour is a touch. A seventh of it is a suspicion: friction may hide a light
-touch for seconds.
+`der_planner.estimation.force` says which force, and where it acts. Without contact what a model
+lacks is not zero either (`der_planner.estimation.free_level`). A distance from that free level
+which noise would pass once in an hour is a touch. A seventh of it is a suspicion: friction may hide
+a light touch for seconds.
 
 A payload is told apart from a touch in this way: it begins at once to pull at the tip along
 gravity, and goes on. It is weighed, and is part of the free level from then on; one that is taken
@@ -20,7 +20,7 @@ from dataclasses import replace
 import numpy as np
 
 from der_planner.arrays import Array
-from der_planner.control.force import (
+from der_planner.estimation.force import (
     EFFECT_WRONG,
     UNLIKELY,
     Touch,
@@ -29,9 +29,9 @@ from der_planner.control.force import (
     locate,
     untouched,
 )
-from der_planner.control.free_level import FreeLevel, Lacking
-from der_planner.control.knowledge import Knowledge
-from der_planner.control.nominal import Nominal
+from der_planner.estimation.free_level import FreeLevel, Lacking
+from der_planner.estimation.knowledge import Knowledge
+from der_planner.estimation.nominal import Nominal
 from der_planner.model import CONTROL_PERIOD, RodModel
 
 _HOUR = 3600.0

@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from der_planner.arrays import Array
-from der_planner.control.knowledge import Knowledge
+from der_planner.estimation.knowledge import Knowledge
 from der_planner.limb import Limb
 
 _FREE_LEVEL = 0.0104, 2e-3
@@ -37,6 +37,8 @@ _FREE_FRICTION = 0.15
 _RUBS_UNEVENLY = 0.2
 """How far friction that is uneven along a segment moves the tip, over how far it bends the segment
 times its length."""
+_DAY = 1 / 3
+"""Share of the first deviations of γ, κ and φ that comes back from one day to the next."""
 _WANDERS = 0.5
 """Share of e in its variance and the noise's."""
 _FORGOTTEN = 1.5
@@ -177,6 +179,11 @@ class FreeLevel:
         rubs = np.vstack([_FREE_FRICTION * np.diag(friction), uneven, uneven])
         known = np.column_stack([self._level, slope, bent, rubs, np.zeros(inputs + 2)])
         self._mean = np.zeros_like(known)
+        told, slopes = np.array(limb.calibrated.free_level), known[:, 1:-1]
+        if len(told) == 2 * slopes.size + len(noise) and not limb.other_mounting:
+            mean, deviation, noise = np.split(told, [slopes.size, 2 * slopes.size])
+            self._mean[:, 1:-1] = mean.reshape(slopes.shape)
+            known[:, 1:-1] = np.hypot(deviation.reshape(slopes.shape), _DAY * slopes)
         self._covariance = known[:, :, None] ** 2 * np.eye(known.shape[1])
         self.noise = noise**2
         self._covariance[:, -1, -1] = _WANDERS * self.noise
@@ -188,6 +195,12 @@ class FreeLevel:
         after.payload = 0.0
         after._covariance[:, 0, 0] += self._level**2
         return after
+
+    def told(self) -> tuple[float, ...]:
+        """Return means and deviations of γ, κ and φ, and the noise, as a limb file keeps them."""
+        deviation = np.sqrt(np.diagonal(self._covariance, axis1=1, axis2=2))
+        kept = self._mean[:, 1:-1], deviation[:, 1:-1], np.sqrt(self.noise)
+        return tuple(float(f"{value:.4g}") for each in kept for value in each.flat)
 
     def expected(self, lacking: Lacking, ahead: float = 0.0) -> tuple[Array, Array]:
         """Return mean and variance (M + 2,), noise and all.

@@ -1,6 +1,7 @@
 """The state estimator: a Kalman filter of what the limb does beside what the model expects.
 
-Its state is the deviation from the model's motion under the plan (`der_planner.control.nominal`):
+Its state is the deviation from the model's motion under the plan
+(`der_planner.estimation.nominal`):
 
     x = (δθ, δθ̇, d, g, b)
 
@@ -30,8 +31,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from der_planner.arrays import Array
-from der_planner.control.knowledge import Estimate, Knowledge
-from der_planner.control.nominal import STEP, ChamberLog, Nominal
+from der_planner.estimation.knowledge import Estimate, Knowledge
+from der_planner.estimation.nominal import STEP, ChamberLog, Nominal
 from der_planner.model import CONTROL_PERIOD, STEPS
 from der_planner.model.material import Memory
 

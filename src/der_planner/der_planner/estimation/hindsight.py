@@ -1,6 +1,6 @@
 """What a recorded run shows of the limb afterwards: the estimator's run, smoothed backward.
 
-The Kalman filter of `der_planner.control.estimation` goes over the whole run; the smoother of
+The Kalman filter of `der_planner.estimation.estimator` goes over the whole run; the smoother of
 Rauch, Tung and Striebel (1965) then brings to each instant what was seen after it.
 """
 
@@ -11,12 +11,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from der_planner.arrays import Array, interpolate
-from der_planner.control.estimation import MISSING_DENSITY, Estimator
-from der_planner.control.force import Touch
-from der_planner.control.nominal import STEP, ChamberLog, Nominal
-from der_planner.control.touch import TouchSense
-from der_planner.model import CONTROL_PERIOD, STEPS
+from der_planner.estimation.estimator import MISSING_DENSITY, Estimator
+from der_planner.estimation.force import Touch
+from der_planner.estimation.nominal import STEP, ChamberLog, Nominal
+from der_planner.estimation.touch import TouchSense
+from der_planner.limb import Limb
+from der_planner.model import CONTROL_PERIOD, STEPS, RodModel, simulate
+from der_planner.planning.motions import Reference
 from der_planner.planning.plan_file import Plan
+from der_planner.planning.timing import resting_spline
 
 _SLOW = 0.0042
 """Density with which the pressure that the model lacks wanders in hindsight, over the limb's
@@ -116,17 +119,45 @@ def touches(plan: Plan, filmed: Filmed) -> list[tuple[Touch, float]]:
     Raises:
         ValueError: no pictures or no measured pressures, or of another limb.
     """
-    estimator, last = _forward(plan, filmed, MISSING_DENSITY)
-    nominal, found = estimator.nominal, dict[float, tuple[Touch, float]]()
-    sense = TouchSense(nominal.model)
-    for j, known in enumerate(estimator.between(0, last)[1]):
-        if j % STEPS == 0:
-            touch = sense.feel(j * STEP, nominal, known)
-            if touch.touched:
-                best, _ = found.get(touch.since, (touch, 0.0))
-                surest = max(best, touch, key=lambda each: each.distance)
-                found[touch.since] = surest, touch.time
+    found = dict[float, tuple[Touch, float]]()
+    for touch in _felt(plan, filmed)[1]:
+        if touch.touched:
+            best, _ = found.get(touch.since, (touch, 0.0))
+            surest = max(best, touch, key=lambda each: each.distance)
+            found[touch.since] = surest, touch.time
     return list(found.values())
+
+
+def free_level(limb: Limb, time: Array, commands: Array, filmed: Filmed) -> tuple[float, ...]:
+    """Return what a calibration run tells of the free level of its limb, for the limb file.
+
+    Args:
+        limb: as it was identified.
+        time: (K,) every 50 ms from 0 on [s].
+        commands: (K, M) then [Pa].
+        filmed: of the run.
+
+    Returns:
+        See `FreeLevel.told`.
+
+    Raises:
+        ValueError: no pictures with a tip, or no measured pressures.
+    """
+    model, name = RodModel(limb), "calibration"
+    response = simulate(model, time, commands=commands)
+    tip, bend = response.tip[:-1], response.bend_angles[:-1]
+    reference = Reference(time, tip, bend, resting_spline(time, bend), bend[0])
+    plan = Plan(time, commands, reference, tip, bend, name, "der", name, 0.0, 0.0, 1, model, 0.0)
+    return _felt(plan, filmed)[0].free.told()
+
+
+def _felt(plan: Plan, filmed: Filmed) -> tuple[TouchSense, list[Touch]]:
+    """Return the touch sense that has watched a whole run, and what it said every 50 ms."""
+    estimator, last = _forward(plan, filmed, MISSING_DENSITY)
+    nominal = estimator.nominal
+    sense = TouchSense(nominal.model)
+    states = estimator.between(0, last)[1][::STEPS]
+    return sense, [sense.feel(k * CONTROL_PERIOD, nominal, known) for k, known in enumerate(states)]
 
 
 def _forward(plan: Plan, filmed: Filmed, missing_density: float) -> tuple[Estimator, int]:

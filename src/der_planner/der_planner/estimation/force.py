@@ -1,6 +1,6 @@
 """The force of a touch, and where it acts: what explains the pressures that a model lacks.
 
-The estimator (`der_planner.control.estimation`) says per segment the pressure d + g w that the
+The estimator (`der_planner.estimation.estimator`) says per segment the pressure d + g w that the
 model lacks, and a displacement b of the tip that the bend angles do not explain. A force f at a
 place s makes both, by the compliance of the rod (`der_planner.model.compliance`): with C_θ and C_r
 of bend and tip by the force, C_w of the bend by pressure, and J = ∂tip/∂θ of evenly bent segments,
@@ -22,7 +22,7 @@ import numpy as np
 from scipy.special import gammainccinv
 
 from der_planner.arrays import Array
-from der_planner.control.free_level import Lacking
+from der_planner.estimation.free_level import Lacking
 from der_planner.model import RodModel
 from der_planner.model.compliance import compliance
 
