@@ -2,8 +2,8 @@
 
 From the estimate at the instant of the next command on, the linear system of
 `der_planner.estimation.nominal` is rolled forward under the commands that would be sent without a
-new correction. It begins with the limb's bends, and with the plan's rates: a command takes effect some
-0.2 s after the picture that it answers, and on a limb whose frequency is not what the model says,
+new correction. It begins with the limb's bends, and with the plan's rates: a command takes effect
+some 0.2 s after the picture that it answers. On a limb whose frequency is not what the model says,
 a swing is by then in another phase than expected and would be driven. Swings are left to the
 limb's own damping. The corrections c (W, M), added to the plan's commands, then minimise
 
