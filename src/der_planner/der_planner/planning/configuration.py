@@ -309,7 +309,9 @@ class LoadedConfiguration(RodConfiguration):
     def curves(self, time: Array) -> Array:
         """Return the centreline of the poses, see `Configuration.curves`."""
         q = sample_spline(self._shape, time)[0]
-        return np.stack([q[:, 0::4], q[:, 1::4]], axis=-1)
+        nodes = np.stack([q[:, 0::4], q[:, 1::4]], axis=-1)
+        clamp = np.zeros((len(nodes), 1 if self.model.kinematics.base else 0, 2))
+        return np.concatenate([clamp, nodes], axis=1)
 
     def pressures(self, method: str, time: Array) -> Array:
         """Return effective pressures (K, M) [Pa] along the poses, see the module."""
