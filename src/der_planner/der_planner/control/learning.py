@@ -297,6 +297,8 @@ class Learner:
                     f"from these two runs; {said}"
                 )
             self._pending = run
+            if self._best is not None and not np.array_equal(run.commands, self._best.commands):
+                self._smaller_step()  # the new commands may have done it
             return False, (
                 f"set aside: {unlike}; if the next run says the same, the limb, its load or its "
                 "rest has changed and learning starts again"
