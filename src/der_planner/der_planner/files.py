@@ -10,16 +10,10 @@ import yaml
 
 
 class _Dumper(yaml.SafeDumper):
-    """Writes numbers of numpy as numbers, and tuples of numbers in brackets."""
-
-
-def _tuple(dumper: _Dumper, values: tuple[Any, ...]) -> yaml.Node:
-    short = all(isinstance(value, (int, float)) for value in values)
-    return dumper.represent_sequence("tag:yaml.org,2002:seq", values, flow_style=short)
+    """Writes numbers of numpy as numbers."""
 
 
 _Dumper.add_multi_representer(np.floating, lambda dumper, n: dumper.represent_float(float(n)))
-_Dumper.add_representer(tuple, _tuple)
 
 
 def write_whole(path: str | Path, text: str) -> None:

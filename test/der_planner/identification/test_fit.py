@@ -159,10 +159,8 @@ def test_a_limb_of_other_pressures_is_found_alike(log, fitted, factor):
 
 def test_a_log_tells_what_the_model_lacks_of_a_free_limb(fitted):
     limb, _ = fitted
-    of = replace(limb.calibrated, free_level=())
-    told, first = (
-        np.array(FreeLevel(each).told()) for each in (limb, replace(limb, calibrated=of))
-    )
+    bare = replace(limb, calibrated=replace(limb.calibrated, free_level=""))
+    told, first = (np.array(FreeLevel(each).told().split(), float) for each in (limb, bare))
     places, deviations = np.arange(24).reshape(4, 6), np.arange(24, 48).reshape(4, 6)
     by_pressure = places[:2, :2], deviations[:2, :2]
     assert np.abs(told[by_pressure[0]]).max() < 0.02

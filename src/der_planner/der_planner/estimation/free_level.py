@@ -179,7 +179,7 @@ class FreeLevel:
         rubs = np.vstack([_FREE_FRICTION * np.diag(friction), uneven, uneven])
         known = np.column_stack([self._level, slope, bent, rubs, np.zeros(inputs + 2)])
         self._mean = np.zeros_like(known)
-        told, slopes = np.array(limb.calibrated.free_level), known[:, 1:-1]
+        told, slopes = np.array(limb.calibrated.free_level.split(), dtype=float), known[:, 1:-1]
         if len(told) == 2 * slopes.size + len(noise) and not limb.other_mounting:
             mean, deviation, noise = np.split(told, [slopes.size, 2 * slopes.size])
             self._mean[:, 1:-1] = mean.reshape(slopes.shape)
@@ -196,11 +196,11 @@ class FreeLevel:
         after._covariance[:, 0, 0] += self._level**2
         return after
 
-    def told(self) -> tuple[float, ...]:
+    def told(self) -> str:
         """Return means and deviations of γ, κ and φ, and the noise, as a limb file keeps them."""
         deviation = np.sqrt(np.diagonal(self._covariance, axis1=1, axis2=2))
         kept = self._mean[:, 1:-1], deviation[:, 1:-1], np.sqrt(self.noise)
-        return tuple(float(f"{value:.4g}") for each in kept for value in each.flat)
+        return " ".join(f"{value:.4g}" for each in kept for value in each.flat)
 
     def expected(self, lacking: Lacking, ahead: float = 0.0) -> tuple[Array, Array]:
         """Return mean and variance (M + 2,), noise and all.

@@ -128,7 +128,7 @@ def touches(plan: Plan, filmed: Filmed) -> list[tuple[Touch, float]]:
     return list(found.values())
 
 
-def free_level(limb: Limb, time: Array, commands: Array, filmed: Filmed) -> tuple[float, ...]:
+def free_level(limb: Limb, time: Array, commands: Array, filmed: Filmed) -> str:
     """Return what a calibration run tells of the free level of its limb, for the limb file.
 
     Args:

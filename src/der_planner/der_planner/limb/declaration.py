@@ -156,6 +156,8 @@ def check(item: Any, where: str = "") -> None:
     """
     for name, declared in declarations(item).items():
         value = getattr(item, name)
+        if isinstance(value, str):
+            value = tuple(map(float, value.split()))
         for number in value if isinstance(value, tuple) else (value,):
             declared.check(number, where + name)
         if value == 0 and declared.needs and getattr(item, declared.needs) != 0:

@@ -267,15 +267,15 @@ class CalibratedRange:
         default=(),
         interval="[0, inf)",
     )
-    free_level: tuple[float, ...] = parameter(
-        "-",
-        "what the model lacks while nothing touches the limb: means and deviations",
-        "the calibration writes it; without it feedback feels less in its first run",
-        default=(),
-    )
     gravity: tuple[float, ...] = parameter(
         "m/s²",
         "gravity for which the limb's numbers were found; empty: the limb's gravity",
         "leave it empty: it is noted where a run is mounted otherwise than the limb file",
         default=(),
+    )
+    free_level: str = parameter(
+        "-",
+        "numbers of what the model lacks while nothing touches the limb",
+        "the calibration writes it; without it a first run feels touch less",
+        default="",
     )
