@@ -78,9 +78,10 @@ def test_a_parameter_that_another_needs_may_not_be_zero():
         changed(Segment, creep_stiffness=1e-3)
 
 
-def test_free_text_of_a_limb_file_takes_no_comments(tmp_path):
+def test_free_text_and_long_text_of_a_limb_file_are_read_back(tmp_path):
     text = {"length": "tape measure", "note": "two lines\nlength: 3\ngravity: none"}
     limb = replace(LIMB, provenance=text, name="gravity: 3\nsegments:\n- length: 1")
+    limb = replace(limb, calibrated=CalibratedRange(free_level=" ".join(52 * ["-1.234e-05"])))
     limb.to_yaml(tmp_path / "limb.yaml")
     assert Limb.from_yaml(tmp_path / "limb.yaml") == limb
 

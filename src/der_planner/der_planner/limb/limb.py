@@ -307,6 +307,6 @@ class Limb:
 
     def to_yaml(self, path: str | Path) -> None:
         """Write a limb file that `from_yaml` reads back as an equal limb, whole or not at all."""
-        text = yaml_text(self.to_mapping(), allow_unicode=True)
+        text = yaml_text(self.to_mapping(), allow_unicode=True, width=math.inf)
         head = "# A limb, in SI units. How to choose each: the site, python3 scripts/docs.py\n"
         write_whole(path, head + commented(text, Limb))
