@@ -179,6 +179,20 @@ def test_another_limb_is_set_aside_once_and_then_learned_from_the_start(learned_
     assert mean_error(after, play(after, swapped)) < mean_error(again, tip) / 2
 
 
+def test_new_commands_whose_run_is_set_aside_are_not_played_again_as_they_were(first):
+    learner, planned, _ = learn(first, other_limb(), 1)
+    learner.add(planned.time, play(planned, other_limb()) + np.array([0.0, 0.08]))
+    assert "set aside" in learner.history[-1].reason
+    again = learner.next()
+    best = first.differential_pressure
+    np.testing.assert_array_equal(again.differential_pressure, best)
+    learner.add(again.time, play(again, other_limb()))
+    before, after = (
+        np.abs(p.differential_pressure - best).mean() for p in (planned, learner.next())
+    )
+    assert 0.0 < after < 0.75 * before
+
+
 def test_a_worse_plan_is_left_for_the_best_with_a_smaller_step(first, learned_twice):
     learner, planned, errors = learned_twice
     best = planned.differential_pressure

@@ -4,6 +4,7 @@ Gains, friction and the camera are a little wrong. What is lacking (`Lacking.val
 c + γ·w + κ·θ + φ·z + e and some noise, with the pressures w of all segments, their bend angles θ
 where gravity bends the limb as well, the share z of its friction that a segment has taken up, and
 an e that wanders and is forgotten. c, γ, κ, φ, e and noise are learned while nothing is touched.
+What a calibration told of γ, κ, φ and the noise stands in the limb file (`FreeLevel.told`).
 
 A segment that sticks is held by anything between its largest friction one way and the other. Its
 model says F z: what is lacking may be anything between F (z − 1) and F (z + 1) then, and nothing

@@ -51,6 +51,7 @@ from der_planner.identification.told import (
 from der_planner.limb import CalibratedRange, Limb
 from der_planner.model import CONTROL_PERIOD, ArcModel, Material, RodModel
 from der_planner.planning.loads import nearly_buckling
+from der_planner.rod import ConvergenceError
 
 MOST_PASSES = 4
 """Largest number of times that lengths and bend angles are fitted in turn, for a limb that its
@@ -71,6 +72,8 @@ STIFFER_STARTS = (0.0, 0.25, 0.5, 0.9)
 the log from there."""
 FARTHEST_WEIGHT = 1.5
 """Place of a known weight, over the prior's length, beyond which it is not in metres."""
+FREE_LEVEL_TOLD = 300.0
+"""Time from the beginning of a log that tells the free level [s]."""
 MISSED = 0.1
 """Error that a fit leaves, over the range of bend angles, from which on it misses the log."""
 _MISSES_ITS_LOG = (
@@ -127,14 +130,15 @@ def fit(
 
 def _with_free_level(limb: Limb, log: CalibrationLog) -> Limb:
     """Return the limb with what the log tells of the free level, by which feedback feels touch."""
-    grid, time = log.resampled(CONTROL_PERIOD), log.time - log.time[0]
-    filmed = Filmed(time, log.measured_differential, time, log.bend_angles, log.tip)
-    commands = np.nan_to_num(grid.commanded_differential)
+    grid = log.between(log.time[0], log.time[0] + FREE_LEVEL_TOLD).resampled(CONTROL_PERIOD)
+    time, held = grid.time - grid.time[0], grid.measured_differential
+    asked = np.where(np.isfinite(grid.commanded_differential), grid.commanded_differential, held)
+    filmed = Filmed(time, held, time, grid.bend_angles, grid.tip)
     try:
-        told = free_level(limb, grid.time - grid.time[0], commands, filmed)
-    except ValueError:  # a log without tips
+        told = free_level(limb, time, np.nan_to_num(asked), filmed)
+        return replace(limb, calibrated=replace(limb.calibrated, free_level=told))
+    except (ValueError, ConvergenceError):  # no tips, or a limb that gives way
         return limb
-    return replace(limb, calibrated=replace(limb.calibrated, free_level=told))
 
 
 def _fit(
