@@ -21,7 +21,7 @@ the bound moves on slowly until the plan is behind it.
 from __future__ import annotations
 
 import math
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -39,6 +39,20 @@ _TOWARDS = 0.25
 """Share of the way to the limit that chambers are asked for at once: forces are told late."""
 _ADVANCE = 1500.0
 """Speed at which the bound moves on where nothing is touched any more [Pa/s]."""
+
+
+class _Bound(NamedTuple):
+    """How far commands may go.
+
+    Attributes:
+        held: (M,) pressures [Pa].
+        harder: (M,) direction from them, of length 1, that presses harder.
+        slides: whether pressures across it may change.
+    """
+
+    held: Array
+    harder: Array
+    slides: bool
 
 
 class Reaction:
@@ -66,8 +80,7 @@ class Reaction:
             )
         self.kind, self.limit = kind, limit
         self.vents = False
-        # Pressures, the direction from them that presses harder, and whether others may change.
-        self._bound: tuple[Array, Array, bool] | None = None
+        self._bound: _Bound | None = None
         self._free, self._kept = 1.0, np.zeros(model.inputs)
         self._newest, self._suspected = self._kept, False
 
@@ -91,30 +104,28 @@ class Reaction:
         elif self._bound is not None:
             self._bound = self._bound_after(self._bound, planned)
 
-    def _bound_of(self, planned: Array, touch: Touch, chambers: Array) -> tuple[Array, Array, bool]:
+    def _bound_of(self, planned: Array, touch: Touch, chambers: Array) -> _Bound:
         """Return the bound while something is touched; arguments as of `follow`."""
         length = max(float(np.linalg.norm(touch.pressure)), _SMALLEST)
         harder: Array = -touch.pressure / length
         if self.kind == "yield" and self.limit is None:
-            return planned, harder, True
+            return _Bound(planned, harder, True)
         size = float(np.linalg.norm(touch.force))
         if self.limit is None or not size > 0.0:
-            held, harder, _ = self._bound or (chambers, harder, False)
-            return held, harder, False
+            return (self._bound or _Bound(chambers, harder, False))._replace(slides=False)
         along = touch.force / size
         # Friction bears a part of the force: it may be larger by two standard deviations.
         most = size + 2.0 * math.sqrt(float(along @ touch.force_covariance @ along))
-        return chambers + _TOWARDS * (self.limit - most) * length / size * harder, harder, True
+        step = _TOWARDS * (self.limit - most) * length / size
+        return _Bound(chambers + step * harder, harder, True)
 
-    def _bound_after(
-        self, bound: tuple[Array, Array, bool], planned: Array
-    ) -> tuple[Array, Array, bool] | None:
+    def _bound_after(self, bound: _Bound, planned: Array) -> _Bound | None:
         """Return what is left of a bound once nothing is touched."""
-        held, harder, others = bound
+        held, harder, _ = bound
         if self.kind == "yield" and self.limit is None and self._suspected:
-            return planned, harder, True
+            return _Bound(planned, harder, True)
         if self.limit is not None and harder @ (planned - held) > 0.0:
-            return held + _ADVANCE * CONTROL_PERIOD * harder, harder, others
+            return bound._replace(held=held + _ADVANCE * CONTROL_PERIOD * harder)
         return None
 
     def corrected(self, wanted: Array) -> Array:
@@ -130,11 +141,11 @@ class Reaction:
         """Return the command (M,) [Pa] in place of a wanted one; from any thread."""
         if self._bound is None:
             return wanted
-        held, harder, others = self._bound
+        held, harder, slides = self._bound
         if self.kind != "yield":
             return held
         further = float(harder @ (wanted - held))
-        return wanted - max(0.0, further) * harder if others else held + min(0.0, further) * harder
+        return wanted - max(0.0, further) * harder if slides else held + min(0.0, further) * harder
 
     def mixed(self, wanted: Array) -> Array:
         """Return wanted corrections (…, M) [Pa] as far as they have come back after a touch.
