@@ -6,7 +6,6 @@ Beside the graphs of all runs, an experiment may have a page.
 from __future__ import annotations
 
 import contextlib
-import math
 import tempfile
 import threading
 import time
@@ -15,6 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.executors import ExternalShutdownException
 
 from der_msgs.msg import PressureState
 from der_planner.experiment.client import GraphClient
@@ -331,9 +331,8 @@ def experiment_page(options: Options, progress: Progress) -> Iterator[NodeProces
             )
             client.watch(())
             ended = threading.Event()
-            # Meanwhile the node says once a second what the experiment does.
             speaker = threading.Thread(
-                target=client.wait_for, args=(ended.is_set, math.inf, "the end"), daemon=True
+                target=_speak, args=(client, ended), name=EXPERIMENT, daemon=True
             )
             speaker.start()
             try:
@@ -343,3 +342,10 @@ def experiment_page(options: Options, progress: Progress) -> Iterator[NodeProces
                 speaker.join(1.0)
     finally:
         page.stop()
+
+
+def _speak(client: GraphClient, ended: threading.Event) -> None:
+    """Serve the node until the end: it says once a second what the experiment does."""
+    with contextlib.suppress(ExternalShutdownException):
+        while not ended.is_set():
+            client.spin(0.1)
