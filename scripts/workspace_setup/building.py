@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import re
@@ -10,7 +9,6 @@ import shutil
 import subprocess
 import sys
 import sysconfig
-from collections.abc import Iterable
 from pathlib import Path
 
 from workspace_setup.basics import (
@@ -30,7 +28,6 @@ from workspace_setup.basics import (
 SUPPORTED = ((3, 10), (3, 13))
 INSTALL = ROOT / "install"
 _COMPILED = re.compile(r"^@(\w+\.)?(njit|\w*kernel)\b", re.MULTILINE)
-_ONE_GROUP = ("apriltag_tracker",)
 HALVES = ("plane", "space")
 """Halves of the kernels; `workspace_setup.kernels` says what belongs to each."""
 
@@ -193,32 +190,6 @@ def build_jobs() -> list[Job]:
     return [Job(what, ["bash", "-c", "\n".join(lines)], clean_environment(), "colcon", finish)]
 
 
-def kernel_digests(source: Path) -> dict[str, str]:
-    """Return a hash over the kernels' sources in each folder below `source` that has some.
-
-    A kernel calls those of its own folder and of the folders in it; folders of a package that call
-    each other share one hash.
-    """
-    groups: dict[str, list[Path]] = {}
-    for path in source.glob("*/*/**/*.py"):
-        if "__pycache__" not in path.parts and _COMPILED.search(path.read_text()):
-            package, _, *folders = path.relative_to(source).parts[:-1]
-            name = package if package in _ONE_GROUP or not folders else f"{package}/{folders[0]}"
-            groups.setdefault(name, []).append(path)
-    return {
-        name: hashlib.sha256(b"".join(path.read_bytes() for path in sorted(paths))).hexdigest()
-        for name, paths in sorted(groups.items())
-    }
-
-
-def drop_stale_kernels(source: Path, changed: Iterable[str]) -> None:
-    """Delete numba's caches of these groups: it looks only at a kernel's own file by itself."""
-    for name in changed:
-        package, *folder = name.split("/")
-        for cache in (source / package / package).joinpath(*folder).rglob("__pycache__/*.nbi"):
-            cache.unlink(missing_ok=True)
-
-
 def kernel_jobs() -> list[Job]:
     """Return what compiles kernels that are new or changed, before several nodes do it at once.
 
@@ -226,12 +197,13 @@ def kernel_jobs() -> list[Job]:
     need only the sources: the packages may be built beside them.
     """
     source, stamp = ROOT / "src", ROOT / "build" / "kernels.json"
-    digests = kernel_digests(source)
-    known = json.loads(stamp.read_text()) if stamp.exists() else {}
-    changed = [name for name, digest in digests.items() if known.get(name) != digest]
-    if not changed:
+    modules = source.glob("*/*/**/*.py")
+    digest = file_digest([path for path in modules if _COMPILED.search(path.read_text())])
+    if stamp.exists() and json.loads(stamp.read_text()) == digest:
         return []
-    drop_stale_kernels(source, changed)
+    # Numba looks only at a kernel's own file. The planner drops its stale caches by itself.
+    for index in (source / "apriltag_tracker").rglob("__pycache__/*.nbi"):
+        index.unlink(missing_ok=True)
     paths = [str(ROOT / "scripts"), *(str(source / package) for package in PACKAGES)]
     inside = {**clean_environment(), "PYTHONPATH": os.pathsep.join(paths)}
     done: list[str] = []
@@ -240,7 +212,7 @@ def kernel_jobs() -> list[Job]:
         done.append("half")
         if len(done) == len(HALVES):
             stamp.parent.mkdir(exist_ok=True)
-            stamp.write_text(json.dumps(digests, indent=1) + "\n")
+            stamp.write_text(json.dumps(digest))
 
     return [
         Job(

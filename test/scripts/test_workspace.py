@@ -111,33 +111,25 @@ def test_jobs_run_beside_each_other_and_a_failed_one_is_named(
     assert finished[2:] == ["good"]
 
 
-@pytest.mark.slow
-def test_a_kernel_is_compiled_again_when_one_that_it_calls_has_changed(tmp_path: Path):
-    from workspace_setup.building import drop_stale_kernels, kernel_digests
+def test_a_changed_kernel_drops_the_caches_of_the_tracker(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    from workspace_setup import basics, building
 
-    inner = tmp_path / "robot" / "robot" / "inner"
-    inner.mkdir(parents=True)
-    (inner / "called.py").write_text(
-        "from numba import njit\n\n\n@njit(cache=True)\ndef one():\n    return 1\n"
-    )
-    (inner / "caller.py").write_text(
-        "from numba import njit\nfrom robot.inner.called import one\n\n\n"
-        "@njit(cache=True)\ndef twice():\n    return 2 * one()\n"
-    )
-
-    def answer() -> str:
-        command = [sys.executable, "-c", "from robot.inner.caller import *; print(twice())"]
-        return subprocess.check_output(command, cwd=tmp_path / "robot", text=True).strip()
-
-    (inner / "plain.py").write_text("HERE = 1\n")
-    before = kernel_digests(tmp_path)
-    assert list(before) == ["robot/inner"]
-    assert answer() == "2"
-    (inner / "plain.py").write_text("HERE = 2\n")
-    assert kernel_digests(tmp_path) == before
-    text = (inner / "called.py").read_text()
-    (inner / "called.py").write_text(text.replace("return 1", "return 10"))
-    assert kernel_digests(tmp_path) != before
-    assert answer() == "2", "numba notices by itself now: the caches need not be dropped"
-    drop_stale_kernels(tmp_path, ["robot/inner"])
-    assert answer() == "20"
+    for module in (basics, building):
+        monkeypatch.setattr(module, "ROOT", tmp_path)
+    package = tmp_path / "src" / "apriltag_tracker" / "apriltag_tracker"
+    cache = package / "camera" / "__pycache__" / "lens.distort-1.py311.nbi"
+    cache.parent.mkdir(parents=True)
+    kernel, plain = package / "kernel.py", package / "plain.py"
+    kernel.write_text("@njit(cache=True)\ndef one(): return 1\n")
+    plain.write_text("HERE = 1\n")
+    for job in building.kernel_jobs():
+        job.finish()
+    cache.touch()
+    plain.write_text("HERE = 2\n")
+    assert building.kernel_jobs() == []
+    assert cache.exists()
+    kernel.write_text("@njit(cache=True)\ndef one(): return 10\n")
+    assert len(building.kernel_jobs()) == 2
+    assert not cache.exists()
