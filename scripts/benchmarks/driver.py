@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from rclpy.publisher import Publisher
 from std_srvs.srv import Trigger
 
 from benchmarks import show
@@ -52,6 +53,13 @@ class Rig:
         self.graph = RunningGraph(self.client, Progress())
         stack.callback(self.graph.stop)
         self.graph.start(nodes, folder, {})
+
+    def setpoint_publisher(self) -> Publisher[PressureSetpoint]:
+        """Return what publishes setpoints, once the driver listens to it."""
+        create = self.client.node.create_publisher
+        publisher = create(PressureSetpoint, topics.PRESSURE_SETPOINT, qos.SETPOINTS)
+        self.client.wait_for(publisher.get_subscription_count, 60.0, "the driver to listen")
+        return publisher
 
 
 Setpoints = dict[int, tuple[float, ...]]
@@ -102,9 +110,7 @@ def _passing_nodes() -> Iterator[None]:
 def _press(rig: Rig, count: int) -> list[float]:
     """Press `vent` under a small command; return the times [s] until it is on the wire."""
     client = rig.client
-    publisher = client.node.create_publisher(
-        PressureSetpoint, topics.PRESSURE_SETPOINT, qos.SETPOINTS
-    )
+    publisher = rig.setpoint_publisher()
     vent = client.node.create_client(Trigger, "pressure_driver/vent")
     client.wait_for(vent.service_is_ready, 20.0, "the service")
 
@@ -115,8 +121,7 @@ def _press(rig: Rig, count: int) -> list[float]:
         return None
 
     def commanded() -> bool:
-        message = PressureSetpoint(plan_id=plan, differential_pressure=[300.0, 0.0])
-        publisher.publish(message)
+        publisher.publish(PressureSetpoint(plan_id=plan, differential_pressure=[300.0, 0.0]))
         client.spin(0.03)
         newest = rig.commands[-1].pressure
         return bool(newest[0] - newest[1] > 200.0)
@@ -134,18 +139,15 @@ def _press(rig: Rig, count: int) -> list[float]:
     return times
 
 
-def _stream(client: GraphClient, seconds: float) -> Setpoints:
+def _stream(rig: Rig, seconds: float) -> Setpoints:
     """Publish a slow motion 0.2 s ahead, as the planner does."""
-    publisher = client.node.create_publisher(
-        PressureSetpoint, topics.PRESSURE_SETPOINT, qos.SETPOINTS
-    )
-    client.wait_for(publisher.get_subscription_count, 20.0, "the driver to listen")
+    publisher = rig.setpoint_publisher()
     start = (time.time_ns() // PERIOD + 10) * PERIOD
     wanted: Setpoints = {}
     for index in range(round(seconds * 1e9 / PERIOD)):
         stamp = start + index * PERIOD
         while time.time_ns() < stamp - 200_000_000:
-            client.spin(0.005)
+            rig.client.spin(0.005)
         phase = 2.0 * np.pi * index * PERIOD / 20e9
         # Never twice the same pair, so that each can be told from the others on the wire.
         values = (6000.0 * (1.0 - np.cos(phase)) + 50.0 + 0.1 * index, -4000.0 - 2.0 * index)
@@ -155,7 +157,7 @@ def _stream(client: GraphClient, seconds: float) -> Setpoints:
         message.header.stamp = stamp_from_nanoseconds(stamp)
         publisher.publish(message)
         wanted[stamp] = values
-    client.spin(0.5)
+    rig.client.spin(0.5)
     return wanted
 
 
@@ -233,7 +235,7 @@ def _measure(case: str, seconds: float, presses: int) -> Samples:
         if case == "storm":
             stack.enter_context(busy_loops(os.cpu_count() or 1))
             stack.enter_context(_passing_nodes())
-        wanted = _stream(client, seconds)
+        wanted = _stream(rig, seconds)
         samples = _compare(wanted, rig)
         client.spin(1.1)
         told = client.diagnostic_values("pressure_driver")

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
 
 from benchmarks import cpu_time, show
 from benchmarks.browser import CHROMEDRIVER, CHROMIUM, open_browser
@@ -107,8 +107,7 @@ class PageGraph(Rig):
 
     def break_board(self, faults: str) -> None:
         """Give the emulated board faults."""
-        value = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=faults)
-        wanted = [Parameter(name="faults", value=value)]
+        wanted = [Parameter("faults", value=faults).to_parameter_msg()]
         self.client.ask(SetParameters, "board_emulator/set_parameters", parameters=wanted)
 
     def measure_cpu(self, seconds: float) -> float:
@@ -147,10 +146,7 @@ def measure_vent(graph: PageGraph, window: Any, count: int) -> dict[str, float]:
     window.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": LISTEN})
     window.refresh()
     graph.wait(lambda: window.execute_script("return !!page.data"), "live data")
-    publisher = graph.client.node.create_publisher(
-        PressureSetpoint, topics.PRESSURE_SETPOINT, qos.SETPOINTS
-    )
-    graph.wait(publisher.get_subscription_count, "the driver to listen")
+    publisher = graph.setpoint_publisher()
     random = np.random.default_rng(1)
     taken: list[float] = []
     lost = 0

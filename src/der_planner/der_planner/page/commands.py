@@ -9,9 +9,9 @@ import uuid
 from dataclasses import dataclass
 from typing import Any
 
-from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
 from der_msgs.msg import MotionCommand, PressureSetpoint
@@ -88,10 +88,8 @@ class Commands:
 
     async def record(self, note: str) -> Answer:
         """Start the recorder with a note in the bag's metadata."""
-        metadata = ParameterValue(
-            type=ParameterType.PARAMETER_STRING, string_value=json.dumps({"note": note})
-        )
-        request = SetParameters.Request(parameters=[Parameter(name="metadata", value=metadata)])
+        metadata = Parameter("metadata", value=json.dumps({"note": note})).to_parameter_msg()
+        request = SetParameters.Request(parameters=[metadata])
         response, trouble = await _ask("recorder", self._recorder_parameters, request)
         if response is None:
             return Answer(False, trouble)
