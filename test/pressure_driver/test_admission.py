@@ -17,7 +17,7 @@ from pressure_driver.schedule import (
 )
 from pressure_driver.settings import Settings
 
-TICK = 50_000_000
+PERIOD = 50_000_000
 
 
 # ----------------------------------------------------------------------- a plan and its arming
@@ -185,7 +185,7 @@ def test_a_higher_revision_that_comes_in_time_replaces_the_earlier_one(simulate)
     assert sim.offer((4_000.0, 0.0), index=5, revision=1) is Verdict.DUPLICATE
     assert "revision 2" in sim.core.machine.schedule.reason
     assert sim.offer((5_000.0, 0.0), index=6, revision=3) is Verdict.DUPLICATE
-    stamp = sim.wall + 4 * TICK
+    stamp = sim.wall + 4 * PERIOD
     sim.run(0.2)
     assert sim.core.machine.schedule.current.differential == (3_000.0, 0.0)
     late = Setpoint(stamp, (6_000.0, 0.0), "plan of arming 1", 5, 3)
@@ -194,7 +194,6 @@ def test_a_higher_revision_that_comes_in_time_replaces_the_earlier_one(simulate)
     assert (counters["accepted"], counters["executed"], counters["superseded"]) == (2, 1, 1)
 
 
-PERIOD = 50_000_000
 NOW = 1_700_000_000 * 1_000_000_000
 ZERO = (0.0, 0.0)
 

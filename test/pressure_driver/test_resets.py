@@ -1,16 +1,18 @@
 """Boards that start again, forget their settings, or stop answering while a limb is driven."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from pressure_driver.emulator import BoardReading
 from pressure_driver.emulator.firmware import BOARDS
 from pressure_driver.protocols import BoardReset, host_protocol
 from pressure_driver.safety import Mode
 from pressure_driver.settings import Settings
 
-PERIOD = 0.05
+AT_REST = BoardReading(0.0, (101_325.0,) * 4, 101_325.0, (0.0,) * 4, 150_000.0)
 
 
 @pytest.mark.parametrize("protocol", ["ezloop", "ctrlp", "native", "festo"])
@@ -89,11 +91,8 @@ def test_one_damaged_report_of_a_ctrlp_board_is_no_reset():
 def test_echoes_and_warnings_of_a_ctrlp_board_are_no_reset():
     host = host_protocol(Settings(protocol="ctrlp"))
     board = BOARDS["ctrlp"]()
-    from pressure_driver.emulator import BoardReading
-
-    reading = BoardReading(0.0, (101_325.0,) * 4, 101_325.0, (0.0,) * 4, 0.0)
     answers = b"".join(
-        board.reply(command, reading)
+        board.reply(command, AT_REST)
         for command in board.decode(host.start() * 2 + host.setpoint([1e3, 0.0, 0.0, 0.0]))
     )
     events = host.decode(answers + b"_UNREC: Unrecognized Command\n")
@@ -130,13 +129,9 @@ def test_lines_of_setpoints_and_of_the_supply_are_no_damage():
 
 def test_the_clock_of_a_native_board_may_overflow():
     host, board = host_protocol(Settings(protocol="native")), BOARDS["native"]()
-    from pressure_driver.emulator import BoardReading
 
     def status(milliseconds):
-        reading = BoardReading(
-            milliseconds / 1000.0, (101_325.0,) * 4, 101_325.0, (0.0,) * 4, 150_000.0
-        )
-        events = host.decode(board.telemetry(reading))
+        events = host.decode(board.telemetry(replace(AT_REST, time=milliseconds / 1000.0)))
         return [e for e in events if isinstance(e, BoardReset)]
 
     assert not status(2**32 - 60)

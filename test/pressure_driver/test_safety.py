@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pressure_driver.protocols import NAMES, BoardFailure, Telemetry, host_protocol
+from pressure_driver.protocols import NAMES, Telemetry, host_protocol
 from pressure_driver.safety import Mode
 from pressure_driver.schedule import Verdict
 from pressure_driver.settings import Settings, declarations
@@ -163,15 +163,6 @@ def test_a_slow_native_board_is_asked_again(simulate):
     assert sim.core.board.identity.firmware == "emulator 1"
 
 
-def test_a_report_of_the_board_is_a_fault(simulate):
-    sim = simulate("native")
-    sim.arm()
-    sim.core._serve(BoardFailure("sensor: channel 3"), sim.steady)
-    assert sim.mode is Mode.FAULT
-    sim.tick()
-    assert sim.is_vent(sim.sent[-1])
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("protocol", NAMES)
@@ -300,24 +291,6 @@ def test_a_broken_chamber_is_noticed_as_soon(simulate, protocol, limit, fault, r
     assert sim.play_until_fault(longest, lambda _: rise(limit)(5.0), "next") <= longest
     assert re.search(reason, sim.faults[0])
     assert sim.gauge.max() < 1.3 * limit
-
-
-@pytest.mark.parametrize("limit", LIMITS)
-def test_a_supply_that_is_lost_is_noticed_at_once(simulate, limit):
-    sim = simulate("native", 1, pressure_limit=limit)
-    sim.arm()
-    sim.stream(3.0, swing_of(limit))
-    sim.have(f"supply:{1e5 + 0.5 * limit}")
-    assert sim.play_until_fault(1.0, swing_of(limit), "next") < 1.0
-    assert "supply too low" in sim.faults[0]
-
-
-@pytest.mark.parametrize("limit", LIMITS)
-def test_a_jump_to_the_limit_is_refused(simulate, limit):
-    sim = simulate("native", pressure_limit=limit)
-    sim.arm()
-    assert sim.offer((limit, 0.0), ahead=0.05) is Verdict.REFUSED
-    assert "changes by" in sim.core.machine.schedule.reason
 
 
 def test_over_pressure_is_seen_where_it_is_beyond_what_a_usual_limb_may_read():
