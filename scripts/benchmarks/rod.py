@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,12 +31,14 @@ class TimedRun(NamedTuple):
     """Newton's."""
 
 
-def cantilever(nodes: int, *, plane: str | None, clamp: str = "ghost", stretch: float = 1.0) -> Rod:
-    """Return the cantilever of the design's check values, its EA times `stretch`."""
+def cantilever(
+    nodes: int = 21, clamp: str = "ghost", plane: str | None = "xz", **options: Any
+) -> Rod:
+    """Return the cantilever of the design's check values; more options as of `Rod.uniform`."""
+    usual = {"EA": YOUNG * AREA, "gravity": (0, 0, GRAVITY)}
     return Rod.uniform(
-        length=LENGTH, nodes=nodes, EI=YOUNG * INERTIA, EA=stretch * YOUNG * AREA,
-        GJ=SHEAR * 2 * INERTIA, mass_per_length=DENSITY * AREA, clamp=clamp,
-        gravity=(0, 0, GRAVITY), plane=plane,
+        length=LENGTH, nodes=nodes, EI=YOUNG * INERTIA, GJ=SHEAR * 2 * INERTIA,
+        mass_per_length=DENSITY * AREA, clamp=clamp, plane=plane, **(usual | options),
     )  # fmt: skip
 
 

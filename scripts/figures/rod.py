@@ -11,7 +11,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
-from benchmarks.rod import cantilever, run_elastica
+from benchmarks.rod import AREA, YOUNG, cantilever, run_elastica
 from der_planner.limb import Limb
 from der_planner.rod import Rod
 from figures.drawing import FOLDER, save
@@ -22,7 +22,7 @@ ELASTICA_TIP_MM = 66.3753  # exact inextensible elastica: examples/cantilever.py
 def statics(folder: Path) -> None:
     """Elastica and circle."""
     figure, axes = plt.subplots(1, 3, figsize=(11, 3.4))
-    rod = cantilever(21, plane="xz")
+    rod = cantilever()
     shape = rod.positions(rod.equilibrium([])) * 1e3
     axes[0].plot(shape[:, 0], shape[:, 2], ".-")
     axes[0].set(title="cantilever under its weight", xlabel="x [mm]", ylabel="z [mm]")
@@ -31,7 +31,7 @@ def statics(folder: Path) -> None:
     for clamp in ("ghost", "inside"):
         tips = []
         for n in sizes:
-            stiff = cantilever(int(n), plane="xz", clamp=clamp, stretch=1e4)
+            stiff = cantilever(int(n), clamp, EA=1e4 * YOUNG * AREA)
             tips.append(-1e3 * stiff.tip(stiff.equilibrium([]))[2])
         axes[1].loglog(sizes, np.abs(np.array(tips) / ELASTICA_TIP_MM - 1) * 100, "o-", label=clamp)
     axes[1].set(title="static tip against the elastica", xlabel="nodes", ylabel="error [%]")
@@ -53,7 +53,7 @@ def statics(folder: Path) -> None:
 def dynamics(folder: Path) -> None:
     """Release of the cantilever, orders, energy."""
     figure, axes = plt.subplots(1, 3, figsize=(14, 3.8))
-    rod = cantilever(21, plane="xz", clamp="inside")
+    rod = cantilever(clamp="inside")
     start = rod.straight_state()
     for method, dt in (("backward_euler", 5e-3), ("midpoint", 1e-2), ("sdirk2", 1e-2)):
         run = rod.simulate(start, np.zeros((round(1 / dt), 0)), dt, method=method)
@@ -77,7 +77,7 @@ def dynamics(folder: Path) -> None:
         axes[1].loglog(steps * 1e3, np.array(errors) * 1e3, "o-", label=method)
     axes[1].set(title="error of the tip at 1 s", xlabel="step [ms]", ylabel="[mm]")
     axes[1].legend()
-    gentle = cantilever(11, plane="xz")
+    gentle = cantilever(11)
     push = np.zeros((11, 3))
     push[-1, 2] = -0.05
     base = gentle.equilibrium([], forces=push)

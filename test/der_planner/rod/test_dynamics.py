@@ -2,38 +2,32 @@
 
 import numpy as np
 import pytest
-from cantilever import YOUNG, cantilever
+from scipy.spatial.transform import Rotation
 
+from benchmarks.rod import YOUNG, cantilever, run_rod
 from der_planner.limb import Limb
 from der_planner.rod import Rod, RodState
 
 
-def released(rod: Rod, dt: float, method: str, duration: float = 1.0) -> np.ndarray:
-    """Displacement of the tip after falling from straight."""
-    still = np.zeros((round(duration / dt), rod.segment_count))
-    tip = rod.simulate(rod.straight_state(), still, dt, method=method).tip
-    return tip[-1] - tip[0]
-
-
 @pytest.mark.parametrize("plane", ["xz", None])
 def test_backward_euler_agrees_with_three_independent_codes(plane):
-    shift = released(cantilever(plane=plane), 5e-3, "backward_euler")
+    shift = run_rod(cantilever(clamp="inside", plane=plane), 5e-3, "backward_euler").tip
     assert shift[2] == pytest.approx(-88.614e-3, abs=5e-7)
     assert shift[0] == pytest.approx(-19.353e-3, abs=5e-7)
     assert shift[1] == 0.0
 
 
 def test_every_method_converges_to_the_known_limit():
-    rod = cantilever()
-    assert released(rod, 1e-4, "midpoint")[2] == pytest.approx(-112.78e-3, abs=1.5e-5)
-    assert released(rod, 2e-4, "sdirk2")[2] == pytest.approx(-112.78e-3, abs=2e-5)
-    coarse, fine = (released(rod, dt, "backward_euler")[2] for dt in (4e-4, 2e-4))
+    rod = cantilever(clamp="inside")
+    assert run_rod(rod, 1e-4, "midpoint").tip[2] == pytest.approx(-112.78e-3, abs=1.5e-5)
+    assert run_rod(rod, 2e-4, "sdirk2").tip[2] == pytest.approx(-112.78e-3, abs=2e-5)
+    coarse, fine = (run_rod(rod, dt, "backward_euler").tip[2] for dt in (4e-4, 2e-4))
     assert 2 * fine - coarse == pytest.approx(-112.78e-3, abs=5e-4)
 
 
 def test_torsional_frequencies():
     """A clamped-free shaft: f = (2n−1)/(4L) √(GJ/ρI), with the polar inertia of a solid circle."""
-    rod = cantilever(81, "ghost", plane=None, gravity=(0, 0, 0))
+    rod = cantilever(81, plane=None, gravity=(0, 0, 0))
     twist = rod.free[rod.free % 4 == 3]
     stiffness = rod.stiffness(rod.straight_state())
     mass = rod.mass_diagonal[twist]
@@ -74,7 +68,7 @@ def total_energy(rod: Rod, q, v) -> float:
 
 @pytest.mark.parametrize("plane", ["xz", None])
 def test_energy_neither_grows_nor_drains_undamped(plane):
-    rod = cantilever(11, "ghost", plane)
+    rod = cantilever(11, plane=plane)
     start = rod.equilibrium([])
     push = np.zeros((11, 3))
     push[-1, 2] = -0.05
@@ -90,7 +84,7 @@ def test_energy_neither_grows_nor_drains_undamped(plane):
 
 @pytest.mark.parametrize("option", [{"damping": 1.5}, {"material_damping": 0.02}])
 def test_damping_drains_energy_and_ends_at_the_equilibrium(option):
-    rod = cantilever(11, "ghost", **option)
+    rod = cantilever(11, **option)
     run = rod.simulate(rod.straight_state(), np.zeros((4000, 0)), 5e-3)
     energy = [total_energy(rod, q, v) for q, v in zip(run.q[::50], run.v[::50], strict=True)]
     assert np.all(np.diff(energy) < 1e-9)
@@ -179,18 +173,10 @@ def test_stiffness_is_the_symmetric_hessian_of_the_energy(options):
     np.testing.assert_allclose(hessian, symmetric, atol=1e-7 * np.abs(hessian).max())
 
 
-def rotation(axis: np.ndarray, angle: float) -> np.ndarray:
-    axis = axis / np.linalg.norm(axis)
-    cross = np.array(
-        [[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]], dtype=float
-    )
-    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
-
-
 def test_rigid_motion_leaves_the_energy_and_turns_the_forces():
     rod = Rod.uniform(**COMMON, clamp="free", rest_curvature=(3.0, -2.0), rest_twist=4.0)
     state = bent_state(rod, 6)
-    turn = rotation(np.array([1.0, -2.0, 0.5]), 1.1)
+    turn = Rotation.from_rotvec([0.5, -1.0, 0.25]).as_matrix()
     q = state.q.copy()
     moved = state.positions @ turn.T + [0.3, -0.1, 0.2]
     for axis in range(3):

@@ -4,9 +4,9 @@ import dataclasses
 
 import numpy as np
 import pytest
-from cantilever import cantilever
 from scipy.integrate import solve_bvp
 
+from benchmarks.rod import cantilever
 from der_planner.limb import GRAVITY, Limb
 from der_planner.model.bending import PolylineKinematics, bend_angles
 from der_planner.rod import ConvergenceError, Rod
@@ -42,7 +42,7 @@ def helix(curvature, torsion, length, nodes):
 
 
 def test_load_stepping_reaches_what_newton_alone_does_not():
-    rod = cantilever(clamp="ghost")
+    rod = cantilever()
     heavy = np.zeros((21, 3))
     heavy[:, 2] = -40 * rod.mass_diagonal[0::4]
     heavy[-1, 0] = -3.0
