@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import array
 import dataclasses
 import subprocess
 import sys
@@ -11,8 +10,8 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
+from pictures import image_message
+from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Image
 
 from apriltag_tracker.camera import CameraPose, Intrinsics, calibration, project
@@ -23,6 +22,8 @@ from apriltag_tracker.sheets import BoardLayout
 from apriltag_tracker.synthetic.camera import SyntheticCamera
 from apriltag_tracker.synthetic.shapes import constant_curvature
 from apriltag_tracker.tag_map import TagMap
+from der_planner.bags.topics import OfferedQos, TopicSpec
+from der_planner.bags.writer import BagWriter
 from limb_interfaces import qos
 
 SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
@@ -181,19 +182,13 @@ def test_the_script_calibrates_a_folder_of_pictures(tmp_path):
 
 
 def test_pictures_come_from_a_bag(tmp_path):
-    types = get_typestore(Stores.ROS2_JAZZY)
-    time, header, image = (
-        types.types[name]
-        for name in ("builtin_interfaces/msg/Time", "std_msgs/msg/Header", "sensor_msgs/msg/Image")
-    )
     pictures = np.random.default_rng(0).integers(0, 256, (6, 48, 64), dtype=np.uint8)
-    with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        link = writer.add_connection(TOPIC, image.__msgtype__, typestore=types)
-        for k, picture in enumerate(pictures):
-            head = header(time(k + 1, 0), "camera")
-            message = image(head, 48, 64, "mono8", 0, 64, picture.ravel())
-            raw = types.serialize_cdr(message, image.__msgtype__)
-            writer.write(link, (k + 1) * 1_000_000_000, raw)
+    bag = BagWriter(tmp_path / "bag")
+    spec = TopicSpec.installed(TOPIC, "sensor_msgs/msg/Image", (OfferedQos(),))
+    for second, picture in enumerate(pictures):
+        stamp = second * 1_000_000_000
+        bag.write(spec, stamp, stamp, serialize_message(image_message(picture, stamp)))
+    bag.close()
     read = [picture for _, picture in from_bag(tmp_path / "bag", TOPIC, every=1.5)]
     assert np.array_equal(read, pictures[::2])
 
@@ -222,13 +217,11 @@ def test_pictures_come_from_a_running_camera(graph, monkeypatch):
     monkeypatch.setenv("ROS_DOMAIN_ID", str(graph.domain_id))
     publisher = graph.client.node.create_publisher(Image, TOPIC, qos.SENSOR_DATA)
     picture = np.arange(48 * 64, dtype=np.uint8).reshape(48, 64)
-    message = Image(height=48, width=64, encoding="mono8", step=64)
-    message.data = array.array("B", picture.tobytes())
     ended = threading.Event()
 
     def show() -> None:
         while not ended.wait(0.02):
-            publisher.publish(message)
+            publisher.publish(image_message(picture))
 
     camera = threading.Thread(target=show)
     camera.start()

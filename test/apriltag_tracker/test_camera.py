@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import copy
-
 import cv2
 import numpy as np
 import pytest
@@ -62,27 +60,13 @@ def test_camera_that_looks_down_is_where_it_was_put():
     assert np.allclose(right, (np.cos(0.7), np.sin(0.7), 0.0))
 
 
-def square(size: float = 0.3) -> np.ndarray:
-    grid = np.linspace(-size, size, 4)
-    x, y = np.meshgrid(grid, grid)
-    return np.column_stack([x.ravel(), y.ravel(), np.zeros(16)])
-
-
-def test_pose_is_recovered_from_fixed_points():
-    lens = intrinsics(PLUMB_BOB)
-    pose = CameraPose.looking_down((0.1, 0.02, 0.8), -1.5, (0.15, -0.1))
-    pixels = project(lens, pose, square())
-    found, residuals = solve_pose(lens, square(), pixels)
-    assert np.allclose(found.rotation, pose.rotation, atol=1e-7)
-    assert np.allclose(found.position, pose.position, atol=1e-7)
-    assert np.abs(residuals).max() < 1e-5
-
-
 def test_a_mirrored_map_is_refused():
     lens = intrinsics([])
     pose = CameraPose.looking_down((0.0, 0.0, 0.8), 0.3)
-    pixels = project(lens, pose, square())
-    mirrored = square() * (1.0, -1.0, 1.0)
+    x, y = np.meshgrid(np.linspace(-0.3, 0.3, 4), np.linspace(-0.3, 0.3, 4))
+    square = np.column_stack([x.ravel(), y.ravel(), np.zeros(16)])
+    pixels = project(lens, pose, square)
+    mirrored = square * (1.0, -1.0, 1.0)
     with pytest.raises(CameraError, match=r"from below|no camera pose"):
         solve_pose(lens, mirrored, pixels)
 
@@ -248,7 +232,6 @@ def _set(*path, value):
     ],
 )
 def test_impossible_maps_are_refused_by_name(content, change, message):
-    content = copy.deepcopy(content)
     change(content)
     with pytest.raises(MapError, match=message):
         TagMap.from_dict(content)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import array
-
 import cv2
 import numpy as np
 import pytest
 import rclpy
 from domain import own_domain
 from geometry_msgs.msg import Point
+from pictures import image_message
 from sensor_msgs.msg import CameraInfo, Image
 from waiting import wait_for
 
@@ -92,14 +91,6 @@ def test_shapes_become_images_and_images_become_the_tip(graph, states, tags):
     client.wait_for(lambda: pictures, PATIENCE, "an annotated picture")
     assert pictures[0].encoding == "bgr8"
     assert len(pictures[0].data) == 3 * 1280 * 720
-
-
-def image_message(gray, stamp):
-    high, wide = gray.shape
-    message = Image(height=high, width=wide, step=wide, encoding="mono8")
-    message.data = array.array("B", gray.tobytes())
-    message.header.stamp = stamp_from_nanoseconds(stamp)
-    return message
 
 
 def test_bad_input_is_named_and_gives_no_state(graph, states, tags, model):

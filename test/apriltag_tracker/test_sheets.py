@@ -122,12 +122,6 @@ def test_codes_that_no_other_library_here_has_are_the_published_ones():
     assert int("".join(map(str, bits)), 2) == 0x1CA92A687
 
 
-@EACH
-def test_printed_cells_have_a_border(each):
-    border = each.printed_cells(7)[each.rim : -each.rim, each.rim : -each.rim]
-    assert set(border[0]) == set(border[:, -1]) == {int(each.outer_ring)}
-
-
 @pytest.mark.parametrize("name", STANDARD)
 def test_standard_tags_are_printed_as_the_c_library_draws_them(name):
     """Every cell of `apriltag_to_image`, which also makes the published pictures of the tags."""
