@@ -160,16 +160,3 @@ def test_a_bent_limb_gives_way_as_the_rod_does():
     found = compliance(model, bend, [place])
     np.testing.assert_allclose(found.tip[0] @ force, (pushed.q - at_rest.q)[-3:-1], rtol=0.03)
     np.testing.assert_allclose(found.bend[0] @ force, model.bend_of(pushed) - bend, rtol=0.03)
-
-
-def test_a_force_across_the_tip_of_a_bent_limb(model):
-    """Of a circular arc: F / EI ∫ arm² ds, with the arms along the tip's own heading."""
-    bend = np.array([0.4, 0.4])
-    found = compliance(model, bend, [LENGTH])
-    across = np.array([-np.sin(0.8), np.cos(0.8)])
-    s = np.linspace(0.0, LENGTH, 20001)
-    radius = LENGTH / 0.8
-    x, y = radius * np.sin(s / radius), radius * (1 - np.cos(s / radius))
-    arm = (x[-1] - x) * np.cos(0.8) + (y[-1] - y) * np.sin(0.8)
-    expected = np.sum(0.5 * (arm[1:] ** 2 + arm[:-1] ** 2)) * s[1] / EI
-    assert across @ found.tip[0] @ across == pytest.approx(expected, rel=0.02)

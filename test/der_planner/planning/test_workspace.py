@@ -161,23 +161,27 @@ def free():
     return plan(LIMB, MOTION, method="projected")
 
 
-def beside(free, share, depth):
-    """Return an obstacle that the limb runs into by a depth [m] where it bends most."""
-    k = int(np.argmax(free.bend_angles.sum(axis=1)))
-    curve = free.curve(k)
+def beside(curve, share, depth):
+    """Return where the middle of a peg is into which a limb of this curve runs by a depth [m]."""
     node = round(share * (len(curve) - 1))
     along = curve[node + 1] - curve[node - 1]
     left = np.array([-along[1], along[0]]) / np.linalg.norm(along)
-    return curve[node] + left * (RADIUS + 0.01 - depth), free.time[k]
+    return curve[node] + left * (RADIUS + 0.01 - depth)
+
+
+def most_bent(motion):
+    """Return the row in which the limb bends most."""
+    return int(np.argmax(motion.bend_angles.sum(axis=1)))
 
 
 @pytest.mark.parametrize("share", [0.5, 0.8])
 def test_a_motion_into_a_peg_is_refused_with_instant_place_and_clearance(free, share):
-    point, when = beside(free, share, 0.006)
+    k = most_bent(free)
+    point = beside(free.curve(k), share, 0.006)
     with pytest.raises(ObstacleError, match="mm into the circle") as refused:
         plan(LIMB, MOTION, method="projected", obstacles=circle(point))
     error = refused.value
-    assert error.time == pytest.approx(when, abs=0.3)
+    assert error.time == pytest.approx(free.time[k], abs=0.3)
     assert error.place == pytest.approx(share * LIMB.length, abs=0.05 * LIMB.length)
     assert error.clearance == pytest.approx(-0.006, abs=1e-3)
     # So it is with a force that is a little too small, and not with one that is enough.
@@ -190,7 +194,7 @@ def test_a_motion_into_a_peg_is_refused_with_instant_place_and_clearance(free, s
 
 @pytest.mark.parametrize("method", ["projected", "optimal"])
 def test_no_allowed_force_leads_a_limb_through_a_peg(free, method):
-    k = int(np.argmax(free.bend_angles.sum(axis=1)))
+    k = most_bent(free)
     half_way = (free.curve(0) + free.curve(k))[len(free.curve(k)) * 4 // 5] / 2
     with pytest.raises(ObstacleError, match="which no force brings about"):
         plan(LIMB, MOTION, method=method, obstacles=circle(half_way, allowed=100.0))
@@ -206,11 +210,7 @@ def test_the_optimal_plan_leads_the_limb_past_what_it_cannot_touch(mounting):
 
     reference = MOTION.reference(Workspace(model))
     poses = curves(reference)
-    k = int(np.argmax(reference.bend_angles.sum(axis=1)))
-    node = round(0.8 * (len(poses[k]) - 1))
-    along = poses[k, node + 1] - poses[k, node - 1]
-    left = np.array([-along[1], along[0]]) / np.linalg.norm(along)
-    way = circle(poses[k, node] + left * (RADIUS + 0.01 - 0.006))
+    way = circle(beside(poses[most_bent(reference)], 0.8, 0.006))
     found = plan(limb, MOTION, obstacles=way)
     past = curves(dataclasses.replace(reference, tip=found.tip_reference))
     assert way.nearest(way.items[0], poses).clearance == pytest.approx(-0.006, abs=1e-3)
@@ -229,7 +229,7 @@ def edge(y, normal):
 
 
 def test_what_is_beside_the_motion_changes_nothing(free):
-    point, _ = beside(free, 0.8, -0.002)
+    point = beside(free.curve(most_bent(free)), 0.8, -0.002)
     for way in (circle(point), edge(-RADIUS - 0.001, 2.0)):
         kept = plan(LIMB, MOTION, method="projected", obstacles=way)
         np.testing.assert_array_equal(kept.differential_pressure, free.differential_pressure)

@@ -176,20 +176,6 @@ def test_impossible_pressures_are_refused(pressure):
         LimbTwin(0, hardware=plain()).step(pressure, 0.1)
 
 
-def test_rows_are_what_was_before_the_setpoint():
-    time = np.arange(40) * 0.05
-    pressure = np.zeros((40, 2))
-    pressure[10:, 0] = 6000.0
-    result = play(time, pressure, seed=2)
-    assert result.tip.shape == (40, 2)
-    assert result.bend_angles.shape == result.measured_differential.shape == (40, 2)
-    assert result.chamber_pressure.shape == (40, 4)
-    still = result.bend_angles[:11]
-    assert np.abs(still - still[0]).max() < np.deg2rad(0.2)
-    np.testing.assert_allclose(result.measured_differential[:11], 0.0, atol=1e-9)
-    assert result.bend_angles[-1, 0] > still[0, 0] + np.deg2rad(5.0)
-
-
 def test_limb_feels_the_boards_pneumatics():
     time = np.arange(30) * 0.05
     pressure = np.tile([0.0, -4000.0], (30, 1))
