@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks import show
 from der_planner.bags.reader import BagReader
 from der_planner.bags.record import ESTIMATE_TYPE
 from der_planner.control.feedback import Feedback
@@ -119,12 +120,7 @@ def _under_events() -> dict[str, float]:
 
 def run(quick: bool = False) -> dict[str, float]:
     """Print and return every figure; ``quick`` leaves the graph out."""
-    figures: dict[str, float] = {}
-    for part in (_under_events,) if quick else (_on_the_graph, _under_events):
-        found = part()
-        for name, value in found.items():
-            quantity, _, unit = name.rpartition("_")
-            shown = f"{value * 100:8.3f} cm" if unit == "m" else f"{value:8.3f} {unit}"
-            print(f"  {quantity:<32} {shown}", flush=True)
-        figures |= found
+    figures = {} if quick else _on_the_graph()
+    figures |= _under_events()
+    show(figures)
     return figures

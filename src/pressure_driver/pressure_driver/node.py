@@ -20,10 +20,10 @@ from limb_interfaces.parameters import ParameterError, check_overrides, declare
 from limb_interfaces.runner import run_node
 from limb_interfaces.stamps import nanoseconds, stamp_from_nanoseconds
 from pressure_driver.port_process import PortProcess
+from pressure_driver.protocols.ezloop import PASCAL_PER_HECTOPASCAL
 from pressure_driver.safety import Mode
 from pressure_driver.settings import Declared, Settings, declarations
 
-PASCAL_PER_HECTOPASCAL = 100.0
 CMD_U_T = "cmd_u_t"
 LIFE_PERIOD = 0.1
 """[s] between two signs of life to the port's process."""

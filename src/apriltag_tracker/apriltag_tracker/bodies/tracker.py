@@ -10,6 +10,7 @@ import math
 from collections import deque
 from dataclasses import dataclass
 from functools import partial
+from statistics import median_high
 from typing import NamedTuple
 
 import numpy as np
@@ -126,9 +127,9 @@ class FrameAssembler:
         self._came.append(stamp)
         if 0 < interval < _CLOCK_SET:
             self._intervals.append(interval)
-        apart = stamp - _median(self._came)
+        apart = stamp - median_high(self._came)
         self.astray.pop(name, None)
-        if abs(apart) > (_OPEN_FRAMES + 0.5) * _median(self._intervals):
+        if abs(apart) > (_OPEN_FRAMES + 0.5) * median_high(self._intervals):
             self.astray[name] = 1e-9 * apart
         return name not in self.astray and interval != 0
 
@@ -137,7 +138,7 @@ class FrameAssembler:
         stamps = [frame.stamp for frame, _ in self._frames]
         lacking = [at for at, (_, given) in enumerate(self._frames) if place not in given]
         at = min(lacking, key=lambda at: abs(stamps[at] - stamp), default=-1)
-        if at < 0 or abs(stamps[at] - stamp) > _TOGETHER * _median(self._intervals):
+        if at < 0 or abs(stamps[at] - stamp) > _TOGETHER * median_high(self._intervals):
             at = bisect.bisect_left(stamps, stamp)
             if at >= self._told:
                 count = len(self._places)
@@ -149,10 +150,6 @@ class FrameAssembler:
         ended = [frame for frame, _ in self._frames[self._told : end]]
         self._frames, self._told = self._frames[end - 1 :], 1
         return ended
-
-
-def _median(values: deque[int]) -> int:
-    return sorted(values)[len(values) // 2]
 
 
 def fit_frame(points: Array, places: Array) -> tuple[BaseFrame, float] | None:

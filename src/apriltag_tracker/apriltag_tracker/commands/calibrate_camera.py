@@ -20,7 +20,6 @@ from pathlib import Path
 
 import numpy as np
 import rclpy
-from ament_index_python.packages import get_package_share_directory
 from numpy.typing import NDArray
 from rclpy.node import Node
 from rosbags.highlevel import AnyReader, AnyReaderError
@@ -36,11 +35,11 @@ from apriltag_tracker.camera.calibration import (
     with_offsets,
 )
 from apriltag_tracker.camera.images import PICTURES, ImageError, ImageReader, read_picture
+from apriltag_tracker.installed import CONFIG
 from apriltag_tracker.sheets import SheetError, add_board_arguments, given_board
 from apriltag_tracker.tag_map import MapError, TagMap
 from limb_interfaces import qos
 
-DEFAULT_MAP = Path(get_package_share_directory("apriltag_tracker")) / "config" / "tags.yaml"
 Picture = tuple[str, NDArray[np.uint8]]
 
 
@@ -201,7 +200,7 @@ def main() -> int:
     add_board_arguments(lens)
     lens.add_argument("--rational", action="store_true", help="eight coefficients, for wide lenses")
     tags = what.add_parser("mounting", parents=[common], help="tags on the straight limb")
-    tags.add_argument("--tag-map", type=Path, default=DEFAULT_MAP, metavar="FILE")
+    tags.add_argument("--tag-map", type=Path, default=CONFIG / "tags.yaml", metavar="FILE")
     tags.add_argument("--calibration", type=Path, required=True, metavar="FILE")
     options = parser.parse_args()
     try:

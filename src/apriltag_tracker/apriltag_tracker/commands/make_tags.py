@@ -10,8 +10,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from ament_index_python.packages import get_package_share_directory
-
+from apriltag_tracker.installed import CONFIG
 from apriltag_tracker.sheets import (
     PAPERS,
     Page,
@@ -23,8 +22,6 @@ from apriltag_tracker.sheets import (
     write_pdf,
 )
 from apriltag_tracker.tag_map import MapError, TagMap
-
-DEFAULT_MAP = Path(get_package_share_directory("apriltag_tracker")) / "config" / "tags.yaml"
 
 
 def _write(pages: list[Page], name: str, options: argparse.Namespace) -> None:
@@ -44,7 +41,7 @@ def main() -> int:
     common.add_argument("--paper", choices=sorted(PAPERS), default="a4")
     common.add_argument("--out", type=Path, default=Path("sheets"), metavar="DIR")
     tags = what.add_parser("tags", parents=[common], help="every tag of a tag map")
-    tags.add_argument("--tag-map", type=Path, default=DEFAULT_MAP, metavar="FILE")
+    tags.add_argument("--tag-map", type=Path, default=CONFIG / "tags.yaml", metavar="FILE")
     board = what.add_parser("board", parents=[common], help="a calibration board")
     add_board_arguments(board)
     options = parser.parse_args()

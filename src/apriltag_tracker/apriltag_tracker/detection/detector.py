@@ -206,14 +206,10 @@ def _find_quads(image: NDArray[np.uint8], smallest: float, faint: bool) -> NDArr
 def _opencv_detector(extent: int, smallest: float, faint: bool) -> Any:
     """Return OpenCV's detector of quadrilaterals, with a dictionary of a tag that nobody prints."""
     parameters = cv2.aruco.DetectorParameters()
-    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
     parameters.minMarkerPerimeterRate = 0.8 * 4.0 * smallest / extent
-    parameters.maxMarkerPerimeterRate = 4.0
     parameters.adaptiveThreshConstant = _FAINT_THRESHOLD if faint else _THRESHOLD
     parameters.adaptiveThreshWinSizeMin = 13
     parameters.adaptiveThreshWinSizeMax = 13
-    parameters.adaptiveThreshWinSizeStep = 10
-    parameters.minCornerDistanceRate = 0.05
     # Else the outline of the white sheet takes the place of the black border inside of it.
     parameters.minMarkerDistanceRate = 0.02
     parameters.minDistanceToBorder = 2

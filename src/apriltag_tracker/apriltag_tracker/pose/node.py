@@ -11,11 +11,9 @@ import importlib
 import math
 import time
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from ament_index_python.packages import get_package_share_directory
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, TransformStamped
 from numpy.typing import NDArray
@@ -24,6 +22,7 @@ from rclpy.qos import QoSProfile
 from scipy.spatial.transform import Rotation
 from visualization_msgs.msg import Marker, MarkerArray
 
+from apriltag_tracker.installed import CONFIG
 from apriltag_tracker.pose.shape import FollowerOptions, LimbEstimate
 from der_msgs.msg import LimbState, TagDetection, TagDetectionArray
 from limb_interfaces import qos, stamps, topics
@@ -49,9 +48,8 @@ class LimbStateNode(Node):
 
     def __init__(self, name: str, map_parameter: str, map_file: str, noun: str) -> None:
         super().__init__(name, namespace=topics.NAMESPACE)
-        share = Path(get_package_share_directory("apriltag_tracker")) / "config" / map_file
         where = f"YAML file: which {noun} is where"
-        self.map_path = str(declare(self, map_parameter, str(share), where))
+        self.map_path = str(declare(self, map_parameter, str(CONFIG / map_file), where))
         late = "from an exposure to its stamp [s]"
         self.sensor_delay = round(1e9 * declare(self, "sensor_delay", 0.0, late, -0.5, 0.5))
         """To be taken off stamps [ns]."""

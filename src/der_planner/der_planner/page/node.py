@@ -10,7 +10,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from ament_index_python.packages import get_package_share_directory
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped
 from rcl_interfaces.msg import Log
@@ -26,6 +25,7 @@ from visualization_msgs.msg import MarkerArray
 from apriltag_tracker.camera import Intrinsics
 from apriltag_tracker.camera.images import ImageReader
 from apriltag_tracker.detection import Tag
+from apriltag_tracker.installed import CONFIG
 from apriltag_tracker.tag_map import TagMap
 from der_msgs.msg import (
     LimbContact,
@@ -71,8 +71,7 @@ class PageNode(Node):
         previewer = self._read_previewer(read)
         report = read("report", "", "folder of an experiment's report, shown once it is there")
         drawings = read("drawings", "~/limb_drawings", "folder of kept drawings")
-        share = Path(get_package_share_directory("apriltag_tracker")) / "config"
-        tag_map = read("tag_map", str(share / "tags.yaml"), "YAML file: where the tags are")
+        tag_map = read("tag_map", str(CONFIG / "tags.yaml"), "YAML file: where the tags are")
         rate = read("picture_rate", 15.0, "pictures a second at most [Hz]", 1.0, 30.0)
         lost = (
             "the driver does as its `on_lost_operator` says when the operator's browser has been "

@@ -21,11 +21,10 @@ from der_planner.bags.run import RunSeries, Stream
 from der_planner.results.errors import error_series
 from der_planner.results.evaluation import DRAWN, RunResult
 from der_planner.results.statistics import learning_curves
-from der_planner.results.tables import CASE, several_limbs
+from der_planner.results.tables import CASE, CM, several_limbs
 
 FORMATS = ("png", "pdf")
 STYLE = Path(__file__).parents[1] / "data" / "paper.mplstyle"
-CM = 100.0
 COLUMN = 3.5
 """Width of a column of a two-column paper [inch]."""
 PAGE = 7.16

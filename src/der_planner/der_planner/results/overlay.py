@@ -14,7 +14,6 @@ from der_planner.arrays import Array
 from der_planner.bags.reader import BagReader
 from der_planner.bags.run import EvaluationError, RunSeries
 from der_planner.results.figures import (
-    CM,
     DASHES,
     PAGE,
     REFERENCE,
@@ -25,6 +24,7 @@ from der_planner.results.figures import (
     shared_legend,
 )
 from der_planner.results.scenes import Picture, Projection, RunImages, Snapshot
+from der_planner.results.tables import CM
 
 INSTANTS = 5
 """Pictures in a row of the figure."""

@@ -5,13 +5,12 @@ from __future__ import annotations
 import array
 import functools
 import time
-from pathlib import Path
 
 import cv2
 import numpy as np
-from ament_index_python.packages import get_package_share_directory
 from sensor_msgs.msg import CameraInfo, Image
 
+from apriltag_tracker.installed import CONFIG
 from apriltag_tracker.synthetic.camera import CameraModel, Errors, Optics, SyntheticCamera
 from apriltag_tracker.synthetic.nodes import ShapeListener
 from apriltag_tracker.synthetic.shapes import Shape
@@ -30,11 +29,10 @@ class SyntheticCameraNode(ShapeListener):
     def __init__(self) -> None:
         super().__init__("synthetic_camera")
         cv2.setNumThreads(1)
-        share = Path(get_package_share_directory("apriltag_tracker")) / "config"
         read = functools.partial(declare, self)
-        tag_map = read("tag_map", str(share / "tags.yaml"), "YAML file: where the tags are")
+        tag_map = read("tag_map", str(CONFIG / "tags.yaml"), "YAML file: where the tags are")
         looks = "YAML file: lens and place of the rendered camera"
-        camera = read("camera_file", str(share / "synthetic_camera.yaml"), looks)
+        camera = read("camera_file", str(CONFIG / "synthetic_camera.yaml"), looks)
         seed = read("seed", 0, "of noise, floor and set-up errors", at_least=0)
         blurred, lit = "blur of the lens, standard deviation in px", "light's range over its mean"
         optics = Optics(

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import functools
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from ament_index_python.packages import get_package_share_directory
 from geometry_msgs.msg import Pose, PoseArray, PoseStamped
 
 from apriltag_tracker.bodies.body_map import BodyMap
 from apriltag_tracker.bodies.forms import message_type, topics_of
+from apriltag_tracker.installed import CONFIG
 from apriltag_tracker.synthetic.nodes import ShapeListener
 from apriltag_tracker.synthetic.poses import UPRIGHT, MocapFaults, SyntheticMocap
 from apriltag_tracker.synthetic.shapes import Shape
@@ -28,8 +27,9 @@ class SyntheticPosesNode(ShapeListener):
 
     def __init__(self) -> None:
         super().__init__("synthetic_poses")
-        share = Path(get_package_share_directory("apriltag_tracker")) / "config" / "bodies.yaml"
-        body_map = declare(self, "body_map", str(share), "YAML file: which body is where")
+        body_map = declare(
+            self, "body_map", str(CONFIG / "bodies.yaml"), "YAML file: which body is where"
+        )
         form = str(declare(self, "form", _FORMS[0], "messages in which poses go", choices=_FORMS))
         seed = declare(self, "seed", 0, "of noise and dropouts", at_least=0)
         number = functools.partial(declare, self)
