@@ -195,13 +195,6 @@ def alarms(situation: Situation) -> list[dict[str, Any]]:
     return found
 
 
-def test_a_limb_that_is_well_alarms_nobody(situation: Situation) -> None:
-    for name in ("pressure_driver", "planner", "recorder"):
-        situation.put_status(status(f"/limb/{name}"))
-    situation.put_driver(state(PressureState.TRACKING, 9_000.0))
-    assert alarms(situation) == []
-
-
 def test_a_page_without_a_driver_says_how_to_start_one(situation: Situation) -> None:
     (alarm,) = alarms(situation)
     assert (alarm["level"], alarm["text"]) == ("notice", "No driver is heard")

@@ -97,16 +97,6 @@ def seal(payload: bytes) -> bytes:
     return coded + b"\0"
 
 
-def unseal(coded: bytes) -> bytes | None:
-    """Return the payload of a frame without its ending zero, or None if it is damaged."""
-    try:
-        data: bytes = cobs.decode(coded)
-    except cobs.DecodeError:
-        return None
-    payload, check = data[:-2], data[-2:]
-    return payload if crc16(payload).to_bytes(2, "little") == check else None
-
-
 def encode(kind: FrameType, sequence: int, body: bytes = b"") -> bytes:
     """Return the wire bytes of a frame."""
     return seal(HEADER.pack(VERSION, kind, sequence & 0xFFFF) + body)
@@ -118,8 +108,12 @@ def cut_frames(kept: bytearray) -> list[Frame | None]:
 
 
 def _read(coded: bytes | None) -> Frame | None:
-    payload = unseal(coded) if coded else None
-    if payload is None or len(payload) < HEADER.size:
+    try:
+        data: bytes = cobs.decode(coded or b"")
+    except cobs.DecodeError:
+        return None
+    payload, check = data[:-2], data[-2:]
+    if len(payload) < HEADER.size or crc16(payload).to_bytes(2, "little") != check:
         return None
     version, kind, sequence = HEADER.unpack_from(payload)
     if version != VERSION or kind not in set(FrameType):
