@@ -57,15 +57,6 @@ def test_projection_is_found_from_the_tags_alone(bag: Path):
     assert project(np.empty((0, 2))).shape == (0, 2)
 
 
-def test_snapshot_is_the_nearest_frame(bag: Path):
-    frames = FRAMES[FRAMES >= 0]
-    with BagReader(bag) as reader:
-        shot = RunImages(reader, load_run(bag)).snapshot(float(frames[40]) + 0.02)
-    assert shot.picture.shape == (240, 320)
-    assert np.all(shot.picture == 40)
-    assert shot.planned.shape == (0, 2)
-
-
 @pytest.mark.slow
 def test_report_is_one_page_with_everything_in_it(bag: Path, tmp_path: Path):
     run = load_run(bag)
