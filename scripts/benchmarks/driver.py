@@ -9,7 +9,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -139,26 +139,33 @@ def _press(rig: Rig, count: int) -> list[float]:
     return times
 
 
-def _stream(rig: Rig, seconds: float) -> Setpoints:
-    """Publish a slow motion 0.2 s ahead, as the planner does."""
-    publisher = rig.setpoint_publisher()
+def play(
+    client: GraphClient,
+    publisher: Publisher[PressureSetpoint],
+    count: int,
+    shape: Callable[[int], tuple[float, ...]],
+    plan_id: str,
+) -> Setpoints:
+    """Publish so many setpoints, each 0.2 s ahead as the planner does; return them."""
     start = (time.time_ns() // PERIOD + 10) * PERIOD
     wanted: Setpoints = {}
-    for index in range(round(seconds * 1e9 / PERIOD)):
+    for index in range(count):
         stamp = start + index * PERIOD
         while time.time_ns() < stamp - 200_000_000:
-            rig.client.spin(0.005)
-        phase = 2.0 * np.pi * index * PERIOD / 20e9
-        # Never twice the same pair, so that each can be told from the others on the wire.
-        values = (6000.0 * (1.0 - np.cos(phase)) + 50.0 + 0.1 * index, -4000.0 - 2.0 * index)
+            client.spin(0.005)
+        wanted[stamp] = shape(index)
         message = PressureSetpoint(
-            plan_id="benchmark", index=index, differential_pressure=list(values)
+            plan_id=plan_id, index=index, differential_pressure=list(wanted[stamp])
         )
         message.header.stamp = stamp_from_nanoseconds(stamp)
         publisher.publish(message)
-        wanted[stamp] = values
-    rig.client.spin(0.5)
     return wanted
+
+
+def _slow_motion(index: int) -> tuple[float, float]:
+    """Return never twice the same pair [Pa], so that each can be told on the wire."""
+    phase = 2.0 * np.pi * index * PERIOD / 20e9
+    return 6000.0 * (1.0 - np.cos(phase)) + 50.0 + 0.1 * index, -4000.0 - 2.0 * index
 
 
 @dataclass
@@ -235,7 +242,9 @@ def _measure(case: str, seconds: float, presses: int) -> Samples:
         if case == "storm":
             stack.enter_context(busy_loops(os.cpu_count() or 1))
             stack.enter_context(_passing_nodes())
-        wanted = _stream(rig, seconds)
+        publisher, count = rig.setpoint_publisher(), round(seconds * 1e9 / PERIOD)
+        wanted = play(client, publisher, count, _slow_motion, "benchmark")
+        client.spin(0.5)
         samples = _compare(wanted, rig)
         client.spin(1.1)
         told = client.diagnostic_values("pressure_driver")

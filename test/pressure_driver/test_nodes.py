@@ -10,9 +10,10 @@ import uuid
 import numpy as np
 import pytest
 from domain import free_port
-from driver_bench import PERIOD, Bench, difference
+from driver_bench import Bench, difference
 from std_msgs.msg import Float64MultiArray
 
+from benchmarks.driver import PERIOD
 from der_msgs.msg import PressureSetpoint, PressureState
 from der_planner.experiment.processes import find_executable
 from limb_interfaces import qos, topics

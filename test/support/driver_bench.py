@@ -9,11 +9,10 @@ import uuid
 
 import numpy as np
 
+from benchmarks.driver import play
 from der_msgs.msg import ChamberPressures, PressureSetpoint, PressureState
 from limb_interfaces import qos, topics
-from limb_interfaces.stamps import stamp_from_nanoseconds
 
-PERIOD = 50_000_000
 VENTED = 500.0
 """[Pa] gauge that counts as vented."""
 QUICK = {
@@ -119,20 +118,8 @@ class Bench:
 
     def play(self, count, shape):
         """Publish setpoints 0.2 s ahead in real time; return stamp -> differential pressures."""
-        start = (time.time_ns() // PERIOD + 8) * PERIOD
-        plan_id = uuid.uuid4().hex  # a plan belongs to one arming
-        wanted = {}
-        for index in range(count):
-            stamp = start + index * PERIOD
-            while time.time_ns() < stamp - 200_000_000:
-                self.client.spin(0.004)
-            message = PressureSetpoint(
-                plan_id=plan_id, index=index, differential_pressure=list(shape(index))
-            )
-            message.header.stamp = stamp_from_nanoseconds(stamp)
-            self.publisher.publish(message)
-            wanted[stamp] = shape(index)
-        return wanted
+        # A plan belongs to one arming.
+        return play(self.client, self.publisher, count, shape, uuid.uuid4().hex)
 
     def pressurise(self):
         """Arm and play until a chamber is full; a machine that stalls may need several turns."""
