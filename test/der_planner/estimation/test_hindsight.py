@@ -4,8 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from limbs import with_segments
 from link_chain import TIP_NOISE, LinkChain
 
+from der_planner.estimation.estimator import Estimator
 from der_planner.estimation.hindsight import Filmed, Smoothed, smooth
 from der_planner.estimation.nominal import STEP, ChamberLog, Nominal
 from der_planner.limb import Limb
@@ -70,6 +72,25 @@ def test_a_run_without_pictures_is_refused(planned):
     nothing = np.full((20, 2), np.nan)
     with pytest.raises(ValueError, match="no picture of the limb"):
         smooth(planned, Filmed(time, np.zeros((20, 2)), time, nothing, nothing))
+
+
+def test_friction_remembers_how_the_limb_bends_and_not_how_it_was_planned_to():
+    limb = with_segments(
+        Limb.default().mounted("45"),
+        friction_moment=lambda s: 900.0 * s.moment_gain,
+        friction_curvature=0.25,
+    )
+    planned = plan(limb, Motion.named("asynchronous", amplitude=0.3, period=12.0, cycles=1))
+    nominal = Nominal(planned)
+    estimator = Estimator(nominal, ChamberLog(nominal))
+    seen, _, tips = nominal.at(planned.time)
+    # Near the straight limb other bends have the same tip.
+    assert np.abs(seen - planned.bend_angles).max() > np.deg2rad(2.5)
+    away = []
+    for time, bend, tip in zip(planned.time, seen, tips, strict=True):
+        estimator.measure(time, bend, tip, None)
+        away.append(estimator.at(time).memory.bend - bend)
+    assert np.abs(away).max() < np.deg2rad(0.5)
 
 
 FALLS_BEHIND = 500.0

@@ -76,6 +76,7 @@ class Nominal:
         tip: (K', 2) of the model at the setpoints, with what a learned plan knows of it [m].
         bend: (K', M) of the model at the setpoints [rad].
         before: (M,) command before the first one [Pa].
+        fine_bend: (K'·STEPS, M) bend of the model amid the fine steps [rad].
         effective: (K'·STEPS, M) effective pressures of the fine steps [Pa].
         taken: (K'·STEPS, M) pressures that friction and creep take of them [Pa].
         is_learned: whether the plan was learned.
@@ -116,7 +117,8 @@ class Nominal:
         inputs = plan.limb.segment_count
         self.effective = response.effective_pressure.reshape(-1, inputs)
         middle = step_middles(count, STEPS)
-        self.fine_bend = sample_spline(spline, middle)[0]
+        # Near the straight limb it bends otherwise than it was planned to, with the same tip.
+        self.fine_bend = self.at(middle)[0]
         self.taken = model.material.memory_pressures(middle, self.fine_bend)
         beyond = plan.chambers_beyond
         self.is_learned = plan.method.startswith(LEARNED)
