@@ -252,6 +252,19 @@ def test_pressures_and_bends_of_two_clocks_are_said(late, said):
     assert prepare(log.seen_earlier(-0.2 * late), LIMB).warnings == ()
 
 
+def test_angles_that_stand_still_while_pressures_change_are_left_out_and_said():
+    log = slow_log()
+    whole, frozen = prepare(log, LIMB), log.time[200] - log.time
+    lost = (frozen <= 0.0) & (frozen > -5.0)
+    log.bend_angles[lost], log.tip[lost] = log.bend_angles[200], log.tip[200]
+    prepared = prepare(log, LIMB)
+    assert not whole.warnings
+    assert f"{lost.sum() - 1} rows repeat the bend angles" in prepared.warnings[0]
+    assert whole.usable.all()
+    assert not prepared.usable[lost][5:-5].any()
+    assert prepared.usable[~lost].all()
+
+
 def test_single_impossible_numbers_are_left_out_and_said():
     log = slow_log()
     log.bend_angles[100, 0], log.measured_differential[200, 1] = 1e9, -1e9

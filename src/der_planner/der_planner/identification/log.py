@@ -37,6 +37,8 @@ ANOTHER_SIDE = math.radians(25.0)
 OTHER_CLOCKS = 3.0, 0.6, 0.25
 """Clocks may differ by up to so much [s]; they do, by this or more, if it leaves this share of the
 squares that pressures do not explain. Friction and slow air leave twice as much."""
+LONGEST_REPEATED = 0.5
+"""Time for which a limb that is driven may show the very same numbers [s]."""
 LONGEST_SWING = 12.0
 """Longest time at the beginning of a log that is waited for a swing to end [s]."""
 
@@ -287,10 +289,31 @@ def _without_outliers(log: CalibrationLog, limb: Limb, warnings: list[str]) -> C
     for what, rows in wrong.items():
         if rows.any():
             warnings.append(f"{rows.sum()} rows have {what} that no such limb has: left out")
+    frozen = _repeated(log, LEAST_EXCITATION * limb.pneumatics.pressure_limit)
+    if frozen.any():
+        warnings.append(
+            f"{frozen.sum()} rows repeat the bend angles of the row before while pressures change, "
+            "as where tags are lost: left out"
+        )
+        wrong["bend angles"], wrong["tips"] = wrong["bend angles"] | frozen, wrong["tips"] | frozen
     tables = (log.measured_differential, log.bend_angles, log.tip)
     pairs = zip(wrong.values(), tables, strict=True)
     pressures, bends, tips = (np.where(rows[:, None], np.nan, table) for rows, table in pairs)
     return replace(log, measured_differential=pressures, bend_angles=bends, tip=tips)
+
+
+def _repeated(log: CalibrationLog, least: float) -> NDArray[np.bool_]:
+    """Return the rows (K,) in which bend angles stand still though pressures change.
+
+    Args:
+        log: of a driven limb.
+        least: change of the pressures since the first of such rows [Pa].
+    """
+    same = np.append(False, np.all(np.diff(log.bend_angles, axis=0) == 0.0, axis=1))
+    first = np.maximum.accumulate(np.where(same, 0, np.arange(len(same))))
+    moved = np.abs(log.measured_differential - log.measured_differential[first]).max(axis=1)
+    counts = same & (log.time - log.time[first] > LONGEST_REPEATED) & (moved > least)
+    return np.asarray(same & np.isin(first, first[counts]))
 
 
 def _check_tips(log: CalibrationLog, limb: Limb) -> None:
