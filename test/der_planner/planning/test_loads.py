@@ -56,6 +56,9 @@ def test_plans_begin_and_end_at_rest_and_reach_their_reference(mounting, name, a
     # The circle takes the hanging limb to its limit of pressure.
     assert result.largest_error < (1.2e-3 if (mounting, name) == ("hanging", "circle") else 5e-4)
     assert result.warnings == ()
+    # The limb that is drawn sags as the one that is planned.
+    drawn = np.array([result.curve(k)[-1] for k in range(len(result.time))])
+    np.testing.assert_allclose(drawn, result.tip_reference, atol=1e-3)
     for end in (0, -1):
         np.testing.assert_allclose(
             result.tip_reference[end], RodModel(limb).rest.q[-3:-1], atol=1e-9

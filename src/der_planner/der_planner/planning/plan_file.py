@@ -55,6 +55,7 @@ class Plan:
         warnings: sentences: limits that cut the wanted pressures, ranges that were left.
         chambers_beyond: (K, M) by how much the chambers held more than their model in the last run
             that a learned plan is from, mean of each period [Pa]; None: nobody told.
+        curves: (K, P, 2) centreline of the reference configuration [m]; None: it bends evenly.
     """
 
     time: Array
@@ -72,6 +73,7 @@ class Plan:
     solve_time: float
     warnings: tuple[str, ...] = ()
     chambers_beyond: Array | None = None
+    curves: Array | None = None
 
     @property
     def limb(self) -> Limb:
@@ -85,7 +87,10 @@ class Plan:
 
     def curve(self, index: int) -> Array:
         """Return the centreline (P, 2) [m] of the reference configuration at a setpoint."""
-        return self.body.kinematics.curve(self.bend_angles[index])
+        if self.curves is None:
+            return self.body.kinematics.curve(self.bend_angles[index])
+        shape: Array = self.curves[index]
+        return shape
 
     @property
     def error(self) -> Array:
@@ -196,15 +201,16 @@ def _plan_of(content: Any) -> Plan:
     time: Array = np.arange(count, dtype=np.float64) * CONTROL_PERIOD
     rest = np.array(content["rest_bend_angles_rad"], dtype=float)
     reference = Reference(time, tip, angles, resting_spline(time, angles, start), rest, start)
-    bend = configure(body, reference).bend_at(time)
+    configuration = configure(body, reference)
     return Plan(
         time=time,
         differential_pressure=command,
         reference=reference,
         tip_predicted=predicted,
-        bend_angles=bend,
+        bend_angles=configuration.bend_at(time),
         body=body,
         chambers_beyond=beyond,
+        curves=configuration.curves(time),
         **{name: kind(content[name]) for name, kind in _SINGLE.items()},
     )
 

@@ -141,6 +141,7 @@ def plan(
         body=body,
         solve_time=clock.perf_counter() - begin,
         warnings=tuple(filter(None, said)),
+        curves=configuration.curves(reference.time),
     )
 
 
