@@ -8,7 +8,7 @@ import pytest
 from limbs import with_segments
 
 from der_planner.control.reaction import Reaction
-from der_planner.estimation.force import untouched
+from der_planner.estimation.force import locate, untouched
 from der_planner.estimation.free_level import FreeLevel, Lacking
 from der_planner.estimation.knowledge import Knowledge
 from der_planner.estimation.touch import TouchSense
@@ -102,6 +102,16 @@ def test_a_force_is_found_with_its_place(model, node, pushed):
     axes = frame(model, node, felt.bend_angles)
     doubt = float(np.sqrt((axes.T @ touch.force_covariance @ axes)[1, 1]))
     assert abs((apart @ axes)[1]) < max(0.15 * abs((force @ axes)[1]), doubt)
+
+
+def test_a_force_that_noise_hardly_lets_tell_is_not_taken_for_a_large_one(model):
+    spread = np.diag(np.array([300.0, 300.0, 1e-3, 1e-3]) ** 2)
+    felt, draw = lacking(model, {15: (0.0, -0.15)}), np.random.default_rng(6)
+    places, forces = np.linspace(0.0, LIMB.length, 61)[1:], []
+    for noise in draw.multivariate_normal(np.zeros(4), spread, 200):
+        noisy = replace(felt, value=felt.value + noise, covariance=spread)
+        forces.append(np.linalg.norm(locate(model, noisy, places).force))
+    assert np.nanmedian(forces) == pytest.approx(0.15, rel=0.4)
 
 
 def test_a_limb_file_that_knows_the_free_level_makes_a_first_run_feel_more(model):
@@ -403,14 +413,23 @@ def test_after_a_touch_a_limit_lets_the_limb_come_back_slowly(model, touch):
     np.testing.assert_array_equal(kept, harder)
 
 
-def test_a_limit_keeps_pressures_until_the_force_is_told(model, touch):
-    reaction = Reaction(model, "yield", 0.4)
+def test_a_limit_lets_go_slowly_until_the_force_is_told(model, touch):
+    reaction, kept = Reaction(model, "yield", 0.4), CHAMBERS
     untold = replace(touch, force=np.full(2, np.nan))
-    for planned in (CHAMBERS, CHAMBERS + 3000.0):
-        kept = reacted(reaction, planned + 6000.0, planned, untold, CHAMBERS)
-        np.testing.assert_array_equal(kept, CHAMBERS)
-    back = reacted(reaction, CHAMBERS - 2000.0, CHAMBERS, untold, CHAMBERS)
-    assert -touch.pressure @ (back - CHAMBERS) < 0.0
+    pressing = -touch.pressure / np.linalg.norm(touch.pressure)
+    for k in range(1, 11):
+        kept = reacted(reaction, CHAMBERS + 9000.0, CHAMBERS, untold, kept)
+        # Across it pressures stay.
+        np.testing.assert_allclose(CHAMBERS - kept, 75.0 * k * pressing, atol=1e-6)
+    back = reacted(reaction, CHAMBERS - 4000.0, CHAMBERS, untold, kept)
+    assert pressing @ (back - kept) < 0.0
+
+
+def test_a_limit_keeps_pressures_while_friction_may_hide_the_rest_of_a_touch(model, touch):
+    reaction, harder = Reaction(model, "yield", 0.1), CHAMBERS + 9000.0
+    kept = reacted(reaction, harder, harder, touch, CHAMBERS)
+    suspected = replace(untouched(2.0, touch.bend_angles), suspected=True)
+    np.testing.assert_array_equal(reacted(reaction, harder, harder, suspected, kept), kept)
 
 
 def test_holding_and_venting_keep_what_the_chambers_had(model, touch):

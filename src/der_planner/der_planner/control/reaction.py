@@ -11,11 +11,12 @@ something is touched, `yield` gives no command u with −ℓ·u above that of th
 moved to the nearest command on that side, until nothing is suspected any more. To retreat farther
 than the plan would do harm where a touch is false.
 
-With a limit in N pressures stay where they are at the touch until its force can be told: they may
-go back, but not along the obstacle, since its direction is not known well either. From then on the
-bound moves slowly to where the force f, with two deviations, would reach the limit: a change −ℓ·δu
-is taken to raise the force by |f|/|ℓ|² of it. Once the limb has gone back and nothing is touched,
-the bound moves on slowly until the plan is behind it.
+With a limit in N pressures go back slowly from where they are at the touch until its force can be
+told: it may be beyond the limit. They do not move along the obstacle, since its direction is not
+known well either. From then on the bound moves slowly to where the force f, with two deviations,
+would reach the limit: a change −ℓ·δu is taken to raise the force by |f|/|ℓ|² of it. Once the limb
+has gone back and nothing is touched, nor suspected, the bound moves on slowly until the plan is
+behind it.
 """
 
 from __future__ import annotations
@@ -37,8 +38,9 @@ _SMALLEST = 1e-9
 """A pressure below this gives no direction [Pa]."""
 _TOWARDS = 0.25
 """Share of the way to the limit that chambers are asked for at once: forces are told late."""
-_ADVANCE = 1500.0
-"""Speed at which the bound moves on where nothing is touched any more [Pa/s]."""
+_SPEED = 1500.0
+"""Speed of the bound where the force cannot be told, and where nothing is touched any more [Pa/s].
+"""
 
 
 class _Bound(NamedTuple):
@@ -112,7 +114,9 @@ class Reaction:
             return _Bound(planned, harder, True)
         size = float(np.linalg.norm(touch.force))
         if self.limit is None or not size > 0.0:
-            return (self._bound or _Bound(chambers, harder, False))._replace(slides=False)
+            bound = self._bound or _Bound(chambers, harder, False)
+            back = 0.0 if self.limit is None else _SPEED * CONTROL_PERIOD
+            return bound._replace(held=bound.held - back * bound.harder, slides=False)
         along = touch.force / size
         # Friction bears a part of the force: it may be larger by two standard deviations.
         most = size + 2.0 * math.sqrt(float(along @ touch.force_covariance @ along))
@@ -122,10 +126,11 @@ class Reaction:
     def _bound_after(self, bound: _Bound, planned: Array) -> _Bound | None:
         """Return what is left of a bound once nothing is touched."""
         held, harder, _ = bound
-        if self.kind == "yield" and self.limit is None and self._suspected:
-            return _Bound(planned, harder, True)
+        if self.kind == "yield" and self._suspected:
+            # Friction may hide a touch that goes on.
+            return _Bound(planned, harder, True) if self.limit is None else bound
         if self.limit is not None and harder @ (planned - held) > 0.0:
-            return bound._replace(held=held + _ADVANCE * CONTROL_PERIOD * harder)
+            return bound._replace(held=held + _SPEED * CONTROL_PERIOD * harder)
         return None
 
     def corrected(self, wanted: Array) -> Array:

@@ -118,6 +118,8 @@ def locate(model: RodModel, lacking: Lacking, places: Array) -> Touch:
     forces = np.linalg.solve(told, pull[..., None])[..., 0]
     left = lacking.value @ weight @ lacking.value - (pull * forces).sum(axis=1)
     likely = -0.5 * (left + np.linalg.slogdet(told)[1]) - np.log(expected[:, 0])
+    # A small force is as likely as a large one: else a place where a large one fits would be told.
+    likely -= np.log(np.hypot(np.linalg.norm(forces, axis=1), _LEAST_ALONG * usual))
     share = np.exp(likely - likely.max())
     share /= share.sum()
     place = float(share @ places)
