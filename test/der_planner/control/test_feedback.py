@@ -284,7 +284,7 @@ def test_what_is_fast_in_corrections_that_swing_is_taken_off_and_the_rest_stays(
     time = 0.05 * np.arange(200)
     turned = 3000.0 * (time > 4.0) * np.exp(-np.maximum(time - 4.0, 0.0))
     wave, follows = np.sin(2 * np.pi * 1.2 * time), 4000.0 * np.sin(2 * np.pi * time / 3.0)
-    quiet = [(wanted, False) for wanted in (75.0 * wave, turned, follows)]
+    quiet = [(wanted, False) for wanted in (100.0 * wave, turned, follows)]
     for wanted, swings in [(1500.0 * wave, True), *quiet]:
         watch = Supervisor(authority=9600.0)
         pairs = np.column_stack([np.zeros(200), 4000.0 + wanted])

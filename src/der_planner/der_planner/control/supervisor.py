@@ -44,7 +44,7 @@ _PATIENCE = 2.0
 _SLOW = 0.5
 """Time in which corrections go to another level, and of each of two low-passes once they swing
 [s]."""
-_SWING = 0.01
+_SWING = 0.014
 """Distance from that level beyond which it swings, as a share of the authority."""
 _TURNS = 3
 """Number of turns within the window that are a swing; friction that turns round makes one."""
