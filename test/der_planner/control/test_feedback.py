@@ -121,6 +121,7 @@ def test_a_limb_that_swings_otherwise_than_its_model_is_followed_and_not_made_wo
     feedback = Feedback(slow)
     alone, fed = play(slow, Chain()), play(slow, Chain(), feedback)
     assert feedback.warnings[0].name == "swings"
+    assert feedback.estimate(20.0).stiffness_ratio > 2.5
     assert fed.error.mean() < 0.7 * alone.error.mean()
 
 

@@ -307,8 +307,8 @@ def sliding(sense, time, missing, doubt=40.0, mass=0.0):
     swings = 0.08 * np.cos(40.0 * time)
     at = bend, np.full(2, 0.1), none
     nominal = SimpleNamespace(at=lambda _: at, periods=lambda _: 0, mass=[mass * np.eye(2)])
-    mean = np.array([0.0, 0.0, swings, swings, missing, 0.0, 0.0, 0.0, 0.0, 0.0])
-    deviation = np.repeat([2e-3, 0.08, doubt, 1e-3, 1e-4], 2)
+    mean = np.array([0.0, 0.0, swings, swings, missing, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    deviation = np.append(np.repeat([2e-3, 0.08, doubt, 1e-3, 1e-4], 2), 0.1)
     memory = Memory(bend, np.ones(2), none)
     known = Knowledge(mean, np.diag(deviation**2), none, memory, none, 15_000.0 * bend)
     return sense.feel(time, nominal, known)

@@ -228,9 +228,11 @@ def test_unknown_models_and_methods_are_named(model_name, method, message):
         plan(LIMB, Motion.named("asynchronous"), model_name, method)
 
 
-def test_what_is_no_motion_is_told_how_to_make_one():
+def test_what_is_no_motion_or_no_obstacles_is_told_how_to_make_them():
     with pytest.raises(PlanningError, match=r"got str: Motion\.named\(name\) with .*, star; or"):
         plan(LIMB, "star")
+    with pytest.raises(PlanningError, match=r"got list: Obstacles\.from_yaml\(path\)"):
+        plan(LIMB, Motion.named("asynchronous"), obstacles=[])
 
 
 def test_cancelling_by_progress_ends_the_planning():

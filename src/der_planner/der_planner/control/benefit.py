@@ -75,8 +75,8 @@ class Benefit:
 
     def __init__(self, nominal: Nominal) -> None:
         self._nominal, inputs = nominal, nominal.model.inputs
-        still = np.eye(2 * inputs) - nominal.transition
-        self._bend = np.linalg.solve(still, nominal.input)[:, :inputs]
+        still = np.eye(2 * inputs) - nominal.fine_transition
+        self._bend = np.linalg.solve(still, nominal.fine_input)[:, :inputs]
         of = nominal.model.air.pneumatics
         self._follows = _step(CONTROL_PERIOD, of.delay + of.time_constant)
         # What corrections that are sent, and all of them, have come to in the chambers: by period.

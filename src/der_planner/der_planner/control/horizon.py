@@ -257,10 +257,11 @@ class Horizon:
         _, _, missing, gain, offset = known.parts
         planned = nominal.effective[fine].reshape(self.window, STEPS, inputs).mean(axis=1)
         push = effective.mean(axis=1) * (1.0 + gain) + missing - planned
-        pushed = np.einsum("wsb,wb->ws", nominal.input[periods], push)
+        transitions, inputs_of = nominal.moves(periods, known.stiffness_ratio)
+        pushed = np.einsum("wsb,wb->ws", inputs_of, push)
         swing = np.append(known.mean[:inputs], np.zeros(inputs))
         bends = np.empty((self.window, inputs))
-        for i, transition in enumerate(nominal.transition[periods]):
+        for i, transition in enumerate(transitions):
             swing = transition @ swing + pushed[i]
             bends[i] = swing[:inputs]
         ends = nominal.periods(first + 1 + np.arange(self.window))
@@ -278,11 +279,12 @@ class Horizon:
         reached = rolled.chambers.derivative(rolled.before).mean(axis=1)
         reached = np.einsum("wvb,vn->wnb", reached, self._hats)
         periods = nominal.periods(rolled.first + np.arange(self.window))
-        driven = np.einsum("wsb,wnb->wsnb", nominal.input[periods] @ slopes, reached)
+        transitions, inputs_of = nominal.moves(periods, known.stiffness_ratio)
+        driven = np.einsum("wsb,wnb->wsnb", inputs_of @ slopes, reached)
         driven = driven.reshape(self.window, 2 * inputs, -1)
         moved = np.zeros(driven.shape[1:])
         turned = np.empty((self.window, inputs, driven.shape[2]))
-        for i, transition in enumerate(nominal.transition[periods]):
+        for i, transition in enumerate(transitions):
             moved = transition @ moved + driven[i]
             turned[i] = moved[:inputs]
         bend = nominal.bend[nominal.periods(rolled.first + 1 + np.arange(self.window))]

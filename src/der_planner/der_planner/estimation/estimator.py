@@ -3,16 +3,17 @@
 Its state is the deviation from the model's motion under the plan
 (`der_planner.estimation.nominal`):
 
-    x = (δθ, δθ̇, d, g, b)
+    x = (δθ, δθ̇, d, g, b, log s)
 
 bend angles [rad] and rates [rad/s], per segment the effective pressure d that the model lacks [Pa]
-and the relative error g of its gain, and a displacement b (2) of the tip that the bend angles do
-not explain [m]. With w the model's effective pressure under the *measured* chamber pressures and w̄
-under the plan,
+and the relative error g of its gain, a displacement b (2) of the tip that the bend angles do not
+explain [m], and how many times stiffer s the limb is than its model, its gains as well. With w the
+model's effective pressure under the *measured* chamber pressures and w̄ under the plan,
 
-    M_w δθ̈ + D_w δθ̇ + K_w δθ = (w − w̄) + d + g w
+    M_w δθ̈ = s ((w − w̄) + d + g w − D_w δθ̇ − K_w δθ)
 
-d, g and b wander. Friction and creep remember the model's bend and the slow part of δθ: the noise
+Where the limb rests, s changes nothing; how quickly it swings tells s. Corrections for a limb that
+swings otherwise than expected would come in the wrong phase, and drive it. d, g and b wander. Friction and creep remember the model's bend and the slow part of δθ: the noise
 of a measurement must not wear off what friction remembers.
 
 Measurements come late and in any order. The filter runs on a grid of `nominal.STEP` and keeps its
@@ -44,8 +45,8 @@ EARLIEST = 2.0
 """The limb is watched from so long before the first setpoint on [s]."""
 _NOISE = (2e-3, 3e-4)
 """Deviation of a measured bend angle [rad] and tip [m] whose covariance is not given."""
-_FIRST = (0.03, 0.03, 0.025, 0.15, 3e-3)
-"""Deviation of δθ [rad], δθ̇ [rad/s], d, g and b [m] before the first measurement.
+_FIRST = (0.03, 0.03, 0.025, 0.15, 3e-3, 0.3)
+"""Deviation of δθ [rad], δθ̇ [rad/s], d, g, b [m] and log s before the first measurement.
 
 Pressures here are shares of the limb's pressure limit.
 """
@@ -65,8 +66,8 @@ _STRANGE = 6.0
 """Squared distance per coordinate from where a measurement counts less."""
 _STRANGEST = 200.0
 """Largest squared distance per coordinate with which one picture counts in their smoothed value."""
-_EVENT = (0.0, 0.5, 0.042, 0.05, 0.0)
-"""What an event adds to the deviation of δθ, δθ̇ [rad/s], d [Pa], g and b."""
+_EVENT = (0.0, 0.5, 0.042, 0.05, 0.0, 0.0)
+"""What an event adds to the deviation of δθ, δθ̇ [rad/s], d [Pa], g, b and log s."""
 
 
 @dataclass(frozen=True)
@@ -108,6 +109,7 @@ class Estimator:
         self._known: dict[int, Knowledge] = {}
         self._last = 0
         self._fresh: set[int] = set()
+        self._log_stiffness = 0.0, _FIRST[-1] ** 2
         self._moves, self._noises = self._prepare(missing_density)
 
     # What comes in -------------------------------------------------------------------------
@@ -117,6 +119,11 @@ class Estimator:
         if not self._known:
             self._last = math.floor(max(time - _WAITED_FOR, -EARLIEST) / STEP)
             self._known[self._last] = self.beginning(self._last)
+
+    def remember(self, other: Estimator) -> None:
+        """Begin with the stiffness that an earlier run of this limb has told."""
+        known = other.at(max(other.newest, 0.0))
+        self._log_stiffness = known.mean[-1], known.covariance[-1, -1]
 
     def take_over(self, other: Estimator, time: float) -> None:
         """Begin at 0 s with what the estimator of another plan of this limb knows then.
@@ -188,6 +195,7 @@ class Estimator:
         known = self.at(time)
         bend, rate, tip = self.nominal.at(time)
         change, speed, missing, gain, offset = known.parts
+        deviation = np.sqrt(np.diag(known.covariance))
         rows = self.output(bend, change)[self.inputs :]
         return Estimate(
             time=time,
@@ -198,7 +206,8 @@ class Estimator:
             gain_error=gain,
             effective_pressure=known.effective,
             tip_offset=offset,
-            deviation=np.sqrt(np.diag(known.covariance)),
+            stiffness_ratio=known.stiffness_ratio,
+            deviation=deviation[:-1],
             tip_covariance=rows @ known.covariance @ rows.T,
             age=time - self.newest,
         )
@@ -208,7 +217,7 @@ class Estimator:
         nominal = self.nominal
         row = nominal.periods(k)
         moved = nominal.moved_tip(nominal.bend[row], known.mean[: self.inputs])
-        gap: Array = nominal.tip[row] + moved + known.mean[-2:] - nominal.reference[row]
+        gap: Array = nominal.tip[row] + moved + known.parts[-1] - nominal.reference[row]
         return gap
 
     def between(self, first: int, last: int) -> tuple[list[Knowledge], list[Knowledge]]:
@@ -220,13 +229,25 @@ class Estimator:
         known = [self._updated(j, k) for j, k in zip(range(first, last + 1), expected, strict=True)]
         return expected, known
 
-    def move(self, j: int, felt: Array) -> Array:
-        """Return F (4M + 2, 4M + 2) of fine step ``j`` under an effective pressure (M,) [Pa]."""
-        k = int(self.nominal.periods(j // STEPS))
-        swing, inputs = 2 * self.inputs, self.inputs
-        move: Array = self._moves[k].copy()
-        move[:swing, swing + inputs : swing + 2 * inputs] = self.nominal.fine_input[k] * felt
-        return move
+    def move(self, j: int, known: Knowledge, felt: Array) -> tuple[Array, Array]:
+        """Return F (4M + 3, 4M + 3) of a fine step, and the mean (4M + 3,) that it leads to.
+
+        Args:
+            j: the step.
+            known: state before it.
+            felt: (M,) effective pressure of the model in it [Pa].
+        """
+        nominal, inputs, swing = self.nominal, self.inputs, 2 * self.inputs
+        k = int(nominal.periods(j // STEPS))
+        push = known.stiffness_ratio * nominal.fine_input[k]
+        move = self._moves[k].copy()
+        move[:swing] *= known.stiffness_ratio
+        move[:swing, swing + inputs : swing + 2 * inputs] = push * felt
+        move[:swing, :swing] += nominal.free
+        mean = move @ known.mean
+        mean[:swing] += push @ (felt - nominal.effective[nominal.steps(j)])
+        move[:swing, -1] = mean[:swing] - nominal.free @ known.mean[:swing]
+        return move, mean
 
     # The filter ----------------------------------------------------------------------------
 
@@ -241,13 +262,14 @@ class Estimator:
         zero = np.zeros(inputs)
         here = self.nominal.steps(first)
         memory = Memory(self.nominal.fine_bend[here], zero, zero)
-        mean, effective = np.zeros(4 * inputs + 2), self.nominal.effective[here]
-        return Knowledge(mean, np.diag(deviation**2), zero, memory, zero, effective)
+        mean, covariance = np.zeros(4 * inputs + 3), np.diag(deviation**2)
+        mean[-1], covariance[-1, -1] = self._log_stiffness
+        return Knowledge(mean, covariance, zero, memory, zero, self.nominal.effective[here])
 
     def _deviations(self, parts: tuple[float, ...]) -> Array:
-        """Return the deviations (4M + 2,) of the state from those of its parts, d in Pa."""
-        units = [1.0, 1.0, self._limit, 1.0, 1.0]
-        return np.repeat(np.multiply(parts, units), [*[self.inputs] * 4, 2])
+        """Return the deviations (4M + 3,) of the state from those of its parts, d in Pa."""
+        units = [1.0, 1.0, self._limit, 1.0, 1.0, 1.0]
+        return np.repeat(np.multiply(parts, units), [*[self.inputs] * 4, 2, 1])
 
     def _forget(self, j: int) -> None:
         """Compute again from boundary ``j`` on."""
@@ -291,19 +313,13 @@ class Estimator:
         if first % STEPS == 0:
             memory, taken = self._remember(known, nominal.fine_bend[steps[0]] + known.slow)
         effective = nominal.model.material.without_memory(differential, taken)
-        push = nominal.fine_input[k]
-        pushed = (effective - nominal.effective[steps]) @ push.T
-        move, noise = self._moves[k].copy(), self._noises[k]
-        swing = 2 * inputs
         share = STEP / _MEMORY_TIME
         for i, felt in enumerate(effective):
             known = self._updated(first + i, self._known[first + i])
-            move[:swing, swing + inputs : swing + 2 * inputs] = push * felt
-            mean = move @ known.mean
-            mean[:swing] += pushed[i]
+            move, mean = self.move(first + i, known, felt)
             self._known[first + i + 1] = Knowledge(
                 mean,
-                move @ known.covariance @ move.T + noise,
+                move @ known.covariance @ move.T + self._noises[k],
                 known.slow + share * (known.mean[:inputs] - known.slow),
                 memory,
                 taken,
@@ -313,17 +329,17 @@ class Estimator:
             )
 
     def _prepare(self, missing_density: float) -> tuple[Array, Array]:
-        """Return F without its column of g, and the covariance that a fine step adds.
+        """Return F and the covariance that a fine step adds, of each control period.
 
-        Of each control period, (K', 4M + 2, 4M + 2).
+        (K', 4M + 3, 4M + 3); F has no columns of g and log s, and of δθ and δθ̇ what forces change.
         """
         nominal, inputs = self.nominal, self.inputs
-        size, swing = 4 * inputs + 2, 2 * inputs
+        size, swing = 4 * inputs + 3, 2 * inputs
         moves = np.tile(np.eye(size), (nominal.count, 1, 1))
-        moves[:, :swing, :swing] = nominal.fine_transition
+        moves[:, :swing, :swing] = nominal.fine_transition - nominal.free
         moves[:, :swing, swing : swing + inputs] = nominal.fine_input
-        moves[:, -2:, -2:] *= math.exp(-STEP / _TIP_TIME)
-        wander = self._deviations((0.0, 0.0, missing_density, _GAIN_DENSITY, _TIP_DENSITY))
+        moves[:, -3:-1, -3:-1] *= math.exp(-STEP / _TIP_TIME)
+        wander = self._deviations((0.0, 0.0, missing_density, _GAIN_DENSITY, _TIP_DENSITY, 0.0))
         noises = np.tile(np.diag(wander**2 * STEP), (nominal.count, 1, 1))
         push = self._limit * _PRESSURE_DENSITY * nominal.fine_input
         noises[:, :swing, :swing] += push @ np.swapaxes(push, 1, 2) / STEP
@@ -340,19 +356,19 @@ class Estimator:
         return history.at(-1), material.pressure_taken(history)[-1]
 
     def output(self, bend: Array, change: Array) -> Array:
-        """Return ∂(bend angles, tip)/∂x (M + 2, 4M + 2) at a change (M,) of bend angles [rad]."""
+        """Return ∂(bend angles, tip)/∂x (M + 2, 4M + 3) at a change (M,) of bend angles [rad]."""
         inputs = self.inputs
-        rows = np.zeros((inputs + 2, 4 * inputs + 2))
+        rows = np.zeros((inputs + 2, 4 * inputs + 3))
         rows[:inputs, :inputs] = np.eye(inputs)
         rows[inputs:, :inputs] = self.nominal.kinematics.tip_jacobians(bend + change)
-        rows[inputs:, -2:] = np.eye(2)
+        rows[inputs:, -3:-1] = np.eye(2)
         return rows
 
     def _update(self, entry: _Measurement, known: Knowledge) -> Knowledge:
         inputs = self.inputs
         bend, _, tip = self.nominal.at(entry.time)
         change = known.mean[:inputs]
-        moved = self.nominal.moved_tip(bend, change) + known.mean[-2:]
+        moved = self.nominal.moved_tip(bend, change) + known.parts[-1]
         seen = np.isfinite(entry.value)
         gap = (entry.value - np.concatenate([bend + change, tip + moved]))[seen]
         rows = self.output(bend, change)[seen]

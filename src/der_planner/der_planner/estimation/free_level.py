@@ -109,7 +109,7 @@ class Lacking:
         rows = np.zeros((inputs + 2, len(known.mean)))
         rows[:inputs, 2 * inputs : 3 * inputs] = np.eye(inputs)
         rows[:inputs, 3 * inputs : 4 * inputs] = np.diag(known.effective)
-        rows[inputs:, 4 * inputs :] = np.eye(2)
+        rows[inputs:, 4 * inputs : -1] = np.eye(2)
         spread = _STILL * rows @ known.covariance @ rows.T
         # A bend that goes the other way than its friction says has turned, and friction with it.
         goes_on = np.maximum(slid * np.sign(turned), 0.0)

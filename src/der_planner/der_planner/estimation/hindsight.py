@@ -187,7 +187,7 @@ def _backward(estimator: Estimator, last: int) -> Smoothed:
     rows = []
     for j in range(last, -1, -1):
         if j < last:
-            move = estimator.move(j, expected[j + 1].effective)
+            move, _ = estimator.move(j, known[j], expected[j + 1].effective)
             before = expected[j + 1]
             gain = np.linalg.solve(before.covariance, move @ known[j].covariance).T
             mean = known[j].mean + gain @ (mean - before.mean)
@@ -197,7 +197,7 @@ def _backward(estimator: Estimator, last: int) -> Smoothed:
     time = np.arange(len(rows), dtype=np.float64) * CONTROL_PERIOD
     means, spreads = (np.array(column[::-1]) for column in zip(*rows, strict=True))
     inputs = estimator.inputs
-    change, speed, missing, gains, offset = np.split(means, np.arange(1, 5) * inputs, axis=1)
+    change, speed, missing, gains, offset = np.split(means[:, :-1], np.arange(1, 5) * inputs, axis=1)
     bend, rate, tip = nominal.at(time)
     outputs = [estimator.output(b, c)[inputs:] for b, c in zip(bend, change, strict=True)]
     squares = [(square, count) for when, square, count in estimator.innovations if when >= 0]
@@ -209,6 +209,6 @@ def _backward(estimator: Estimator, last: int) -> Smoothed:
         tip_covariance=np.array([row @ p @ row.T for row, p in zip(outputs, spreads, strict=True)]),
         missing_pressure=missing,
         gain_error=gains,
-        deviation=np.sqrt(np.diagonal(spreads, axis1=1, axis2=2)),
+        deviation=np.sqrt(np.diagonal(spreads, axis1=1, axis2=2))[:, :-1],
         innovation=sum(s for s, _ in squares) / max(1, sum(n for _, n in squares)),
     )

@@ -23,6 +23,7 @@ class Estimate:
         gain_error: (M,) relative error of the model's effective pressure.
         effective_pressure: (M,) of the model, without either [Pa].
         tip_offset: (2,) displacement of the tip that the bend does not explain [m].
+        stiffness_ratio: how many times stiffer than its model the limb is, as its swings tell.
         deviation: (4M + 2,) standard deviations of bend_angle, bend_rate, missing_pressure,
             gain_error and tip_offset, in this order.
         tip_covariance: (2, 2) [m²].
@@ -37,6 +38,7 @@ class Estimate:
     gain_error: Array
     effective_pressure: Array
     tip_offset: Array
+    stiffness_ratio: float
     deviation: Array
     tip_covariance: Array
     age: float
@@ -47,7 +49,7 @@ class Knowledge:
     """The filter at a boundary of fine steps.
 
     Attributes:
-        mean: (4M + 2,) x.
+        mean: (4M + 3,) x.
         covariance: of x.
         slow: (M,) slow part of δθ [rad].
         memory: of friction and creep.
@@ -69,4 +71,9 @@ class Knowledge:
     @property
     def parts(self) -> list[Array]:
         """δθ [rad], δθ̇ [rad/s], d [Pa] and g [-], (M,) each, and b (2,) [m]."""
-        return np.split(self.mean, np.arange(1, 5) * len(self.taken))
+        return np.split(self.mean[:-1], np.arange(1, 5) * len(self.taken))
+
+    @property
+    def stiffness_ratio(self) -> float:
+        """How many times stiffer than its model the limb is, gains and all, as its swings tell."""
+        return float(np.exp(self.mean[-1]))

@@ -83,7 +83,7 @@ class Nominal:
         watched: whether readings of the chambers are compared with the model: not on a learned plan
             that does not say what its chambers hold beyond their model.
         fine_transition, fine_input: (K', 2M, 2M) and (K', 2M, M) of (δθ, δθ̇) in one fine step.
-        transition, input: the same of a control period.
+        free: (2M, 2M) transition in a fine step in which no forces act.
         mass: (K', M, M) M_w [Pa s²].
     """
 
@@ -156,6 +156,21 @@ class Nominal:
         middle = (np.arange(len(self._beyond)) + 0.5) * CONTROL_PERIOD
         return interpolate(time, middle, self._beyond)
 
+    def moves(self, k: Whole, stiffness_ratio: float) -> tuple[Array, Array]:
+        """Return transitions (W, 2M, 2M) and inputs (W, 2M, M) of (δθ, δθ̇) in control periods (W,).
+
+        Args:
+            k: the periods.
+            stiffness_ratio: how many times stiffer than the model the limb is, gains as well.
+        """
+        forced = np.concatenate([self.fine_transition[k] - self.free, self.fine_input[k]], axis=2)
+        step = np.tile(np.eye(forced.shape[2]), (len(k), 1, 1))
+        both = len(self.free)
+        step[:, :both, :both] = self.free
+        step[:, :both] += stiffness_ratio * forced
+        whole = np.linalg.matrix_power(step, STEPS)
+        return whole[:, :both, :both], whole[:, :both, both:]
+
     def moved_tip(self, bend: Array, change: Array) -> Array:
         """Return by how much the tip moves (…, 2) [m] if bend angles (…, M) change [rad]."""
         return self.kinematics.tip(bend + change) - self.kinematics.tip(bend)
@@ -199,9 +214,9 @@ class Nominal:
         system[:, rates, rates] = -np.linalg.solve(mass, damping)
         system[:, rates, 2 * inputs :] = np.linalg.inv(mass)
         both = 2 * inputs
-        fine, whole = expm(system * STEP), expm(system * CONTROL_PERIOD)
+        fine = expm(system * STEP)
         self.fine_transition, self.fine_input = fine[:, :both, :both], fine[:, :both, both:]
-        self.transition, self.input = whole[:, :both, :both], whole[:, :both, both:]
+        self.free = np.eye(both) + STEP * np.eye(both, k=inputs)
         self.mass = mass
 
 

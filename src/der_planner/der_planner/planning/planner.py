@@ -91,6 +91,11 @@ def plan(
             f"a motion is expected, got {type(motion).__name__}: Motion.named(name) with "
             f"{', '.join(NAMES)}; or Motion.from_tip_path(time, points)"
         )
+    if not isinstance(obstacles, Obstacles | None):
+        raise PlanningError(
+            f"obstacles are expected, got {type(obstacles).__name__}: "
+            "Obstacles.from_yaml(path) or Obstacles.from_mapping(content)"
+        )
     method = choose_method(model, method)
     report = progress or (lambda _share: None)
     # Its matrices are small: more threads only get into other processes' way.
