@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 import socket
 import time
@@ -24,6 +25,8 @@ TOUCHED = "something touched the limb"
 """How the planner begins to say why a plan has ended, where it had the limb vented for that."""
 PRESSED = 1.0 / 24.0
 """A limb counts as under pressure from this share of the driver's limit on."""
+SENSOR_OFFSET = 1_000.0
+"""[Pa] that a sensor of a vented chamber may read above the others."""
 
 
 @dataclass
@@ -53,6 +56,16 @@ _LAST_WORDS = Duration(seconds=0.2)
 """Listeners have this long to receive what a node says last."""
 _CPU_INTERVAL = 0.5
 """Shortest time over which the CPU time is measured [s]: over less, its own ticks show."""
+
+
+def highest_gauge(state: msg.PressureState) -> float:
+    """Return the highest gauge pressure in a chamber [Pa], also where both of a pair are full.
+
+    It is 0 where it may be a sensor's offset, and NaN where it is not known.
+    """
+    measured, commanded = state.measured_chamber, state.commanded_chamber
+    highest = max(measured, default=math.nan) - min(commanded, default=math.nan)
+    return 0.0 if highest < SENSOR_OFFSET else highest
 
 
 @cache
