@@ -124,10 +124,10 @@ class DiagnosticsPublisher:
     def _look_for_namesake(self, message: DiagnosticArray) -> None:
         """End this node where an older one of its name is alive; one that was killed is silent."""
         own = self._node.get_fully_qualified_name()
-        for status in message.status:
+        for status in (each for each in message.status if each.name == own):
             said = {pair.key: pair.value for pair in status.values}
             process, started = said.get("process", ""), float(said.get("started", "inf"))
-            if status.name == own and process != self._process and started < self._started:
+            if process != self._process and started < self._started:
                 self._node.fatal_error = (
                     f"a node {own} is running already (process {process}): end it first, give this "
                     "one another name or namespace (--ros-args -r __ns:=/OTHER), or set another "
