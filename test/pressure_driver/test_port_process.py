@@ -230,7 +230,7 @@ def test_by_hand_it_takes_lines_from_a_terminal(rig):
     rig.wait_vented()
     process.stdin.close()
     assert process.wait(30.0) == 0
-    assert "'ventt' is not taken: write arm, vent" in process.stdout.read()
+    assert "['ventt'] is no order: write arm, vent" in process.stdout.read()
 
 
 def test_a_switch_that_is_neither_true_nor_false_is_refused(monkeypatch, capsys):

@@ -68,6 +68,12 @@ def highest_gauge(state: msg.PressureState) -> float:
     return 0.0 if highest < SENSOR_OFFSET else highest
 
 
+def is_vented(state: msg.PressureState, limit: float) -> bool:
+    """Tell whether all pressures are known and small beside the driver's limit [Pa]."""
+    told = (*state.measured_differential, highest_gauge(state))
+    return all(abs(value) < PRESSED * limit for value in told)
+
+
 @cache
 def message_version() -> str:
     """Return a short digest of all messages of the project: nodes with another do not hear this."""

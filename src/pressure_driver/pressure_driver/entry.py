@@ -89,8 +89,9 @@ class Terminal(Channel):
             pressures = [float(word) for word in words]
             return ["setpoint", 0, pressures, "", 0, 0, "", self._count, True], None
         if words[0] not in ("arm", "vent", "end", "alive"):
-            told = f"'{' '.join(words)}' is not taken: write arm, vent, or a pressure [Pa] a segment"
-            print(told, flush=True)
+            print(
+                f"{words} is no order: write arm, vent or one pressure [Pa] a segment", flush=True
+            )
             words = ["alive"]
         return words[:1], None
 
