@@ -82,6 +82,7 @@ def test_a_second_node_of_a_name_ends_with_the_remedy():
         executor.add_node(made)
 
         told = made.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        told.publish(DiagnosticArray(status=[status("motor", started="at noon")]))  # of another lab
         told.publish(DiagnosticArray(status=[status("/twice", process="lab:1", started="9e99")]))
         assert publisher.publish() == "ok"
         told.publish(DiagnosticArray(status=[status("/twice", process="lab:2", started="17.0")]))

@@ -18,7 +18,7 @@ from domain import free_port
 from serial import SerialException
 from waiting import wait_for
 
-from pressure_driver import lines, port_process
+from pressure_driver import entry, lines, port_process
 from pressure_driver.board import BoardProcess
 from pressure_driver.emulator.board import EmulatedBoard, Faults
 from pressure_driver.emulator.firmware import BOARDS
@@ -226,9 +226,18 @@ def test_by_hand_it_takes_lines_from_a_terminal(rig):
     for line in ("500 0\n", "3000 -2000\n"):
         process.stdin.write(line)
     wait_for(rig.pressurised, "pressure")
+    process.stdin.write("ventt\nVent\n")
+    rig.wait_vented()
     process.stdin.close()
     assert process.wait(30.0) == 0
-    rig.wait_vented()
+    assert "['ventt'] is no order: write arm, vent" in process.stdout.read()
+
+
+def test_a_switch_that_is_neither_true_nor_false_is_refused(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["board", "--supply-required", "yes"])
+    with pytest.raises(SystemExit):
+        entry.board()
+    assert "--supply-required: invalid true_or_false value: 'yes'" in capsys.readouterr().err
 
 
 # ------------------------------------------------------------- one of the two processes ends

@@ -214,5 +214,12 @@ def test_reports_of_another_language_are_said_to_be_so(simulate):
     sim.run(3.0)
     (obstacle,) = sim.core.obstacles()
     assert "not of this language" in obstacle
-    assert sim.core.protocol.last_damaged.startswith("[VAL]: 0,00")
+    assert "(the last: [VAL]: 0,00" in obstacle
     assert not sim.core.arm()[0]
+
+
+def test_reports_in_another_unit_are_said_to_be_implausible(simulate):
+    sim = simulate("ezloop")
+    sim.board.telemetry = lambda: b"[MPR]: 101.33 101.32 101.30 101.35\n[RPR]: 140.0\n"  # kPa
+    sim.run(3.0)
+    assert "chamber 0 has no plausible reading: 10133 Pa" in sim.core.obstacles()[0]

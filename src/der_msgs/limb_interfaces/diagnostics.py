@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 import socket
 import time
@@ -24,6 +25,8 @@ TOUCHED = "something touched the limb"
 """How the planner begins to say why a plan has ended, where it had the limb vented for that."""
 PRESSED = 1.0 / 24.0
 """A limb counts as under pressure from this share of the driver's limit on."""
+SENSOR_OFFSET = 1_000.0
+"""[Pa] that a sensor of a vented chamber may read above the others."""
 
 
 @dataclass
@@ -53,6 +56,22 @@ _LAST_WORDS = Duration(seconds=0.2)
 """Listeners have this long to receive what a node says last."""
 _CPU_INTERVAL = 0.5
 """Shortest time over which the CPU time is measured [s]: over less, its own ticks show."""
+
+
+def highest_gauge(state: msg.PressureState) -> float:
+    """Return the highest gauge pressure in a chamber [Pa], also where both of a pair are full.
+
+    It is 0 where it may be a sensor's offset, and NaN where it is not known.
+    """
+    measured, commanded = state.measured_chamber, state.commanded_chamber
+    highest = max(measured, default=math.nan) - min(commanded, default=math.nan)
+    return 0.0 if highest < SENSOR_OFFSET else highest
+
+
+def is_vented(state: msg.PressureState, limit: float) -> bool:
+    """Tell whether all pressures are known and small beside the driver's limit [Pa]."""
+    told = (*state.measured_differential, highest_gauge(state))
+    return all(abs(value) < PRESSED * limit for value in told)
 
 
 @cache
@@ -111,10 +130,10 @@ class DiagnosticsPublisher:
     def _look_for_namesake(self, message: DiagnosticArray) -> None:
         """End this node where an older one of its name is alive; one that was killed is silent."""
         own = self._node.get_fully_qualified_name()
-        for status in message.status:
+        for status in (each for each in message.status if each.name == own):
             said = {pair.key: pair.value for pair in status.values}
             process, started = said.get("process", ""), float(said.get("started", "inf"))
-            if status.name == own and process != self._process and started < self._started:
+            if process != self._process and started < self._started:
                 self._node.fatal_error = (
                     f"a node {own} is running already (process {process}): end it first, give this "
                     "one another name or namespace (--ros-args -r __ns:=/OTHER), or set another "

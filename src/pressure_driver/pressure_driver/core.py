@@ -255,8 +255,7 @@ class DriverCore:
         self._last_tick = instant
         if self.monitor.silence(now):
             self.protocol.doubt()
-        vent = self.machine.tick(instant, now)
-        self.venting = vent or bool(self.protocol.unsettled)
+        self.venting = self.machine.tick(instant, now) or bool(self.protocol.unsettled)
         if self.venting:
             self.machine.command_nothing()
             return self.board.greeting(now) + self.protocol.vent()

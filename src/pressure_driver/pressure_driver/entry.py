@@ -83,12 +83,26 @@ class Terminal(Channel):
                 raise BlockingIOError
             text = os.read(self.fileno(), 4096).decode()
             self._lines += text.splitlines() if text else ["end"]
-        words = self._lines.popleft().split() or ["alive"]
+        words = self._lines.popleft().lower().split() or ["alive"]
         self._count += 1
         with contextlib.suppress(ValueError):
             pressures = [float(word) for word in words]
             return ["setpoint", 0, pressures, "", 0, 0, "", self._count, True], None
+        if words[0] not in ("arm", "vent", "end", "alive"):
+            print(
+                f"{words} is no order: write arm, vent or one pressure [Pa] a segment", flush=True
+            )
+            words = ["alive"]
         return words[:1], None
+
+
+def true_or_false(text: str) -> bool:
+    """Return what a switch is set to.
+
+    Raises:
+        ValueError: it is neither; argparse names it and this function.
+    """
+    return bool(("false", "true").index(text.lower()))
 
 
 def board() -> int:
@@ -97,7 +111,7 @@ def board() -> int:
         prog="board", description="Drive a valve board: arm, vent, or one pressure [Pa] a segment."
     )
     for name, declaration, default in declarations(Settings):
-        kind = (lambda text: text.lower() == "true") if isinstance(default, bool) else type(default)
+        kind = true_or_false if isinstance(default, bool) else type(default)
         parser.add_argument(
             f"--{name.replace('_', '-')}",
             type=kind,

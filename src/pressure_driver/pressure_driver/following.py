@@ -73,8 +73,7 @@ class Following:
         passed = max(now - self._time, 0.0)
         decay = math.exp(-passed / self._settings.slowest_vent)
         self._upper = self._command + (self._upper - self._command) * decay
-        risen = self._lower + passed * self._settings.slowest_fill
-        self._lower = min(risen, self._command)
+        self._lower = min(self._lower + passed * self._settings.slowest_fill, self._command)
         self._time = now
 
     def receive(self, gauge: float, opening: float, now: float) -> None:

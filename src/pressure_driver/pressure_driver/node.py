@@ -119,8 +119,7 @@ class PressureDriver(Node):
 
     def _offer(self, setpoint: tuple[object, ...], topic: str, info: dict[str, int]) -> None:
         alone = self.count_publishers(topic) <= 1
-        number = info["publication_sequence_number"]
-        self._port.send("setpoint", *setpoint, topic, number, alone)
+        self._port.send("setpoint", *setpoint, topic, info["publication_sequence_number"], alone)
 
     def _ask(self, word: str, _: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:
         answer.success, answer.message = self._port.ask(word)

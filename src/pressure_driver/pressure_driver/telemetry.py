@@ -160,7 +160,7 @@ class TelemetryMonitor:
         self._settings = settings
         self._protocol = protocol
         self._following = [Following(chamber, settings) for chamber in range(count)]
-        self._bad_chamber = 0
+        self._bad = 0, math.nan
         self.forget()
 
     def forget(self) -> None:
@@ -228,7 +228,7 @@ class TelemetryMonitor:
         bad = [chamber for chamber, value in enumerate(reading) if not low < value < high]
         if bad:
             self._lines.append((now, 0, 0, 1))
-            self._bad_chamber = bad[0]
+            self._bad = bad[0], reading[bad[0]]
             return
         if tuple(reading) != tuple(self.chamber_pressure):
             self._changed_at = now
@@ -268,13 +268,16 @@ class TelemetryMonitor:
         """Return that the board is silent or speaks without being understood, or nothing."""
         age = self.telemetry_age(now)
         if math.isnan(age):
-            damaged = self._recent_lines(now)[1]
+            _, damaged, bad = self._recent_lines(now)
+            if bad >= MOST_BAD_READINGS:
+                return self._describe_nonsense(bad)
             if damaged < MOST_DAMAGED:
                 return "no telemetry from the board yet"
+            line = self._protocol.last_damaged
             return (
                 f"no telemetry from the board yet: {damaged} lines or frames of the last "
-                f"{READING_WINDOW:g} s are not of this language and number of chambers (see "
-                "'last_damaged_line' in the diagnostics); look at 'protocol', 'baud_rate' and "
+                f"{READING_WINDOW:g} s are not of this language and number of chambers"
+                f"{line and f' (the last: {line})'}; look at 'protocol', 'baud_rate' and "
                 "'segment_count'"
             )
         if age > self._settings.telemetry_timeout:
@@ -286,6 +289,13 @@ class TelemetryMonitor:
                 "rounded, set the parameter 'frozen_time' to 0"
             )
         return ""
+
+    def _describe_nonsense(self, count: int) -> str:
+        (chamber, value), (low, high) = self._bad, self._plausible
+        return (
+            f"chamber {chamber} has no plausible reading: {value:.0f} Pa, and {count} of the last "
+            f"{READING_WINDOW:g} s were no number or outside {low:.0f} to {high:.0f} Pa"
+        )
 
     def following_faults(self, now: float) -> Iterator[str]:
         """Say which chambers do not follow their commands, or lose air."""
@@ -346,11 +356,7 @@ class TelemetryMonitor:
         sound, damaged, bad = self._recent_lines(now)
         total = damaged + sound
         if bad >= MOST_BAD_READINGS:
-            low, high = self._plausible
-            yield Condition(
-                f"chamber {self._bad_chamber} has no plausible reading: {bad} of the last "
-                f"{READING_WINDOW:g} s were no number or outside {low:.0f} to {high:.0f} Pa"
-            )
+            yield Condition(self._describe_nonsense(bad))
         if damaged >= MOST_DAMAGED and damaged >= DAMAGED_SHARE * total:
             yield Condition(
                 f"damaged telemetry: {damaged} of {total} lines or frames in the last "

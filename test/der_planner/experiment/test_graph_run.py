@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
+import sys
 from unittest.mock import Mock
 
 import pytest
@@ -23,6 +26,23 @@ def test_a_living_driver_vents_and_the_port_of_a_dead_one_is_given_time(alive: b
     assert [call.args for call in client.spin.call_args_list] == [(PORT_VENTS,)] * (not alive)
     warned = "may still be under pressure (no answer); close its air supply"
     assert (warned in capsys.readouterr().err) == alive
+
+
+def test_a_driver_vents_though_the_terminal_was_closed(monkeypatch):
+    far, near = os.pipe()
+    os.close(far)
+    client = Mock()
+    client.call.side_effect = GraphError("no answer")
+    with os.fdopen(near, "w", buffering=1) as closed:
+        monkeypatch.setattr(sys, "stderr", closed)
+        progress = Progress()
+        progress.bar(1.0, 2.0, "played")
+        driver = Mock(alive=True)
+        RunningGraph(client, progress, processes={"pressure_driver": driver}).vent_after_error()
+        monkeypatch.undo()
+        with contextlib.suppress(BrokenPipeError):
+            closed.close()
+    client.call.assert_called_once_with("pressure_driver/vent")
 
 
 @pytest.mark.parametrize(

@@ -43,6 +43,13 @@ def test_a_ramp_down_after_an_earlier_plan_does_not_concern_the_next_one():
     assert found.obstacle() is None
 
 
+def test_setpoints_that_the_driver_refused_are_counted_once_and_anew_for_a_new_driver():
+    found = DriverWatch(lambda: 0.0, timeout=1.0)
+    for told, new in ((7, 7), (158, 151), (158, 0), (2, 0), (5, 3)):
+        found.update(PressureState(mode=TRACKING, setpoints_refused=told), ())
+        assert found.newly_refused() == new
+
+
 def test_a_driver_that_falls_silent_is_lost_and_one_that_was_never_heard_is_not():
     now = [0.0]
     found, _ = watch(ARMED, time=lambda: now[0])

@@ -219,6 +219,19 @@ def test_a_limb_is_under_pressure_from_a_share_of_the_drivers_limit_on(
 
 
 @pytest.mark.parametrize(
+    ("kept", "limb"), [(9_000.0, "under pressure (9.0 kPa)"), (900.0, "without pressure")]
+)
+def test_a_pair_that_does_not_vent_is_under_pressure_though_it_does_not_differ(
+    situation: Situation, kept: float, limb: str
+) -> None:
+    message = state(PressureState.FAULT, 0.0)
+    message.commanded_chamber = [101_000.0] * 4
+    message.measured_chamber = [101_000.0 + gauge for gauge in (kept, kept, 0.0, 0.0)]
+    situation.put_driver(message)
+    assert situation.snapshot()["limb_is"] == limb
+
+
+@pytest.mark.parametrize(
     ("measured", "limb"),
     [(13_400.0, "under pressure (13.4 kPa)"), (40.0, "without pressure"), (math.nan, "unknown")],
 )

@@ -10,7 +10,7 @@ import pytest
 from runs import FRAMES, TIMES, reference, series
 
 from der_planner.bags.record import Revisions
-from der_planner.bags.run import BoardLog, PressureArrays
+from der_planner.bags.run import BoardLog, PressureArrays, Stream
 from der_planner.bags.series import described, latencies
 from der_planner.results import (
     Description,
@@ -241,6 +241,16 @@ def test_constant_offset_is_the_error_and_the_bias():
     assert result.predicted_error_m == pytest.approx(0.001)
     assert result.valid_fraction == 1.0
     assert result.problems == ()
+
+
+@pytest.mark.parametrize(("played", "problems"), [(1.0, 0), (0.95, 0), (0.0, 1), (-1.0, 1)])
+def test_a_run_of_which_the_driver_commanded_something_else_says_so(played, problems):
+    plan = 8_000.0 * np.sin(TIMES)[:, None] * [1.0, -0.5]
+    run = series(reference(FRAMES))
+    run = replace(run, setpoints=Stream(TIMES, plan), commanded=Stream(TIMES, played * plan))
+    found = evaluate_run(run).problems
+    assert len(found) == problems
+    assert all("the driver commanded other pressures" in text for text in found)
 
 
 def test_components_are_means_of_absolute_values():

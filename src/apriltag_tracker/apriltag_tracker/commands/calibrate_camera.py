@@ -122,8 +122,7 @@ def pictures(options: argparse.Namespace) -> Iterator[Picture]:
 
 def intrinsics(options: argparse.Namespace) -> None:
     """Calibrate the camera and write the result."""
-    layout = given_board(options)
-    finder = BoardFinder(layout)
+    finder = BoardFinder(given_board(options))
     views, unseen, size = [], [], None
     for name, image in pictures(options):
         if size is not None and image.shape != size:

@@ -42,13 +42,11 @@ def main() -> int:
     common.add_argument("--out", type=Path, default=Path("sheets"), metavar="DIR")
     tags = what.add_parser("tags", parents=[common], help="every tag of a tag map")
     tags.add_argument("--tag-map", type=Path, default=CONFIG / "tags.yaml", metavar="FILE")
-    board = what.add_parser("board", parents=[common], help="a calibration board")
-    add_board_arguments(board)
+    add_board_arguments(what.add_parser("board", parents=[common], help="a calibration board"))
     options = parser.parse_args()
     try:
         if options.what == "tags":
-            pages = tag_pages(TagMap.from_yaml(options.tag_map), options.paper)
-            _write(pages, "tags", options)
+            _write(tag_pages(TagMap.from_yaml(options.tag_map), options.paper), "tags", options)
         else:
             _write([board_page(given_board(options), options.paper)], "board", options)
     except (MapError, SheetError, OSError) as error:

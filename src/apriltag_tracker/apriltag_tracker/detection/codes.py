@@ -87,8 +87,7 @@ def _grid(family: Family) -> _Grid:
 
     def through(ring: NDArray[np.bool_]) -> NDArray[np.float64]:
         # The three are at right angles to each other on a ring.
-        fitted = planes[:, ring].T / np.sum(planes[:, ring] ** 2, axis=1)
-        return np.asarray(fitted @ planes)
+        return np.asarray((planes[:, ring].T / np.sum(planes[:, ring] ** 2, axis=1)) @ planes)
 
     return _Grid(
         np.array([[low, high], [high, high], [high, low], [low, low]], dtype=np.float32),

@@ -198,8 +198,7 @@ def _find_quads(image: NDArray[np.uint8], smallest: float, faint: bool) -> NDArr
         image = np.asarray(cv2.GaussianBlur(image, (3, 3), 0.0), dtype=np.uint8)
     found, _, others = _opencv_detector(max(image.shape), smallest, faint).detectMarkers(image)
     corners = [np.asarray(quad, dtype=np.float64).reshape(4, 2) for quad in (*found, *others)]
-    table = np.array(corners).reshape(-1, 4, 2)
-    return np.ascontiguousarray(table[:, _FROM_OPENCV])
+    return np.ascontiguousarray(np.array(corners).reshape(-1, 4, 2)[:, _FROM_OPENCV])
 
 
 @functools.lru_cache(maxsize=32)

@@ -137,8 +137,7 @@ class LimbEstimate:
     @property
     def tip_sigma(self) -> float:
         """Standard deviation of the tip in its least certain direction, of both parts [m]."""
-        both = self.tip_covariance + self.tip_systematic
-        return float(np.sqrt(np.linalg.eigvalsh(both)[-1]))
+        return float(np.sqrt(np.linalg.eigvalsh(self.tip_covariance + self.tip_systematic)[-1]))
 
 
 def centreline_pose(

@@ -157,8 +157,7 @@ class WorldPose:
 
     def _pose_covariance(self, pose: CameraPose, ids: Sequence[int]) -> NDArray[np.float64]:
         """Carry the noise of the averaged corners over to the pose that fits them best, (6, 6)."""
-        points = np.vstack([self._places[tag] for tag in ids])
-        seen = points @ pose.rotation.T + pose.translation
+        seen = np.vstack([self._places[tag] for tag in ids]) @ pose.rotation.T + pose.translation
         lens, still = self._intrinsics, np.zeros(3)
         _, slopes = cv2.projectPoints(seen, still, still, lens.matrix, lens.distortion)
         # Of a point in the camera's frame, the first six are by a turn and a shift there.

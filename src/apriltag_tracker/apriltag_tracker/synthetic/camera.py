@@ -231,8 +231,7 @@ class SyntheticCamera:
         x, y = x / size.width - 0.5, y / size.width - 0.5 * size.height / size.width
         field_ = 0.6 * x - 0.4 * y - 1.2 * (x * x + y * y)
         field_ -= field_.mean()
-        light = 1.0 + self.optics.light_fall * field_
-        return np.ascontiguousarray(light, dtype=np.float32)
+        return np.ascontiguousarray(1.0 + self.optics.light_fall * field_, dtype=np.float32)
 
     def _make_noise(self) -> NDArray[np.int8]:
         drawn = self._random.standard_normal(_NOISE_LENGTH, dtype=np.float32) * self.optics.noise

@@ -84,6 +84,5 @@ class SyntheticMocap:
         noise = faults.direction_noise * self._random.standard_normal((count, 3))
         turns = Rotation.from_matrix(self.rotation @ axes) * Rotation.from_rotvec(noise)
         quaternions = np.asarray(turns.as_quat(), dtype=np.float64)
-        lost = self._random.random(count) < faults.dropout
-        positions[lost] = np.nan
+        positions[self._random.random(count) < faults.dropout] = np.nan
         return PoseFrame(stamp, positions / bodies.unit, quaternions)

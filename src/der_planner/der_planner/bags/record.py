@@ -309,7 +309,7 @@ def _note_clocks(clocks: dict[str, str], message: Any) -> None:
     """Take what nodes say of their clocks in a `DiagnosticArray`, in ms of the driver's."""
     for status in message.status:
         told = {pair.key: pair.value for pair in status.values}
-        if "clock_offset_s" in told:
+        if "clock_uncertainty_s" in told:  # a node of ours
             offset, error = (1e3 * float(told[f"clock_{n}_s"]) for n in ("offset", "uncertainty"))
             clocks[status.name] = f"{-offset:+.2f} ± {error:.2f} ms"
 

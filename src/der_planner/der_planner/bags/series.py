@@ -170,8 +170,7 @@ def _choose_plan(limb: LimbRecord, where: str, plan_id: str) -> str:
         )
     if plan_id and plan_id not in usable:
         raise EvaluationError(f"{where}: no plan '{plan_id}', only {', '.join(sorted(usable))}")
-    most = max(usable, key=lambda name: (len(limb.setpoints[name]), usable[name][0]))
-    return plan_id or most
+    return plan_id or max(usable, key=lambda name: (len(limb.setpoints[name]), usable[name][0]))
 
 
 def _origin(stamp: int, times: Array, setpoints: _Setpoints) -> int:

@@ -108,8 +108,7 @@ def main(parser: argparse.ArgumentParser) -> int:
         content["found"] = lines
         if clamp is not None and is_off(clamp):
             _move_base(content, map_path, clamp, given.out)
-        text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
-        write_whole(given.out, text)
+        write_whole(given.out, yaml.safe_dump(content, sort_keys=False, allow_unicode=True))
         print(f"rig file: {given.out}")
     return 0
 

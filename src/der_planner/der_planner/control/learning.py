@@ -179,8 +179,7 @@ class Learner:
             self._beyond = beyond
         self._given = False
         number, mean = len(self.history) + 1, float(missed.mean())
-        run = LearningRun(number, mean, seen, accepted, said)
-        self.history.append(run)
+        self.history.append(LearningRun(number, mean, seen, accepted, said))
 
     def next(self) -> Plan:
         """Return the plan to play next; until a run is added it stays the same.

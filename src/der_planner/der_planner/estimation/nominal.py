@@ -189,8 +189,7 @@ class Nominal:
         jacobian = self.kinematics.tip_jacobians(bend)
         square = np.einsum("kai,kaj->kij", jacobian, jacobian)
         square += _SEGMENTS_KNOWN**2 * np.eye(bend.shape[1])
-        load = np.einsum("kai,ka->ki", jacobian, moved)
-        return np.linalg.solve(square, load[..., None])[..., 0]
+        return np.linalg.solve(square, np.einsum("kai,ka->ki", jacobian, moved)[..., None])[..., 0]
 
     def _linearise(self, time: Array) -> None:
         balance = self.model.balance.projected

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import functools
 import os
 import signal
@@ -37,7 +38,7 @@ class Progress:
         """Print one line."""
         self.newest = text.strip()
         self._end_bar()
-        print(text, file=sys.stderr, flush=True)
+        self._print(text)
 
     def fail(self, text: str) -> None:
         """Print why the command has failed."""
@@ -55,17 +56,22 @@ class Progress:
         share = min(max(done / total, 0.0), 1.0) if total > 0 else 1.0
         line = f"  [{'#' * int(30 * share):<30}] {max(done, 0.0):5.0f} / {total:.0f} {unit} {text}"
         if self._terminal:
-            print(f"\r{line:<100}", end="", file=sys.stderr, flush=True)
+            self._print(f"\r{line:<100}", end="")
             self._open_line = True
             if finished:
                 self._end_bar()
         else:
-            print(line, file=sys.stderr, flush=True)
+            self._print(line)
 
     def _end_bar(self) -> None:
         if self._open_line:
-            print(file=sys.stderr)
+            self._print("")
             self._open_line = False
+
+    def _print(self, text: str, end: str = "\n") -> None:
+        """Print; a terminal that was closed must not keep anybody from venting the limb."""
+        with contextlib.suppress(OSError):
+            print(text, end=end, file=sys.stderr, flush=True)
 
 
 def interrupt_once() -> None:

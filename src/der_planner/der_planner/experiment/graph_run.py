@@ -30,7 +30,7 @@ from der_planner.experiment.processes import (
 )
 from limb_interfaces import qos, topics
 from limb_interfaces.clocks import CLOCK_OFF, LARGEST, Offset
-from limb_interfaces.diagnostics import PRESSED, DiagnosticsPublisher, Health, message_version
+from limb_interfaces.diagnostics import DiagnosticsPublisher, Health, is_vented, message_version
 from pressure_driver.protocols import USUAL_LIMIT
 
 DISCOVERY = 1.0
@@ -268,10 +268,9 @@ class RunningGraph:
 
         def vented() -> bool:
             state = self.client.newest.get(topics.PRESSURE_STATE)
-            measured = state.measured_differential if state is not None else []
             told = self.client.diagnostic_values("pressure_driver")
-            most = PRESSED * float(told.get("pressure_limit_pa", USUAL_LIMIT))
-            return bool(measured) and all(abs(value) < most for value in measured)
+            limit = float(told.get("pressure_limit_pa", USUAL_LIMIT))
+            return state is not None and is_vented(state, limit)
 
         self.client.wait_for(vented, 30.0, "the chambers to vent")
 

@@ -137,8 +137,7 @@ class _Chambers:
 
     def fit(self, names: tuple[str, ...], start: Mapping[str, float] | None = None) -> AirFit:
         """Fit the numbers of these names, from other starts where they are given."""
-        fitted = [_NUMBERS[name] for name in names]
-        begin, low, high, scale = np.array(fitted).T
+        begin, low, high, scale = np.array([_NUMBERS[name] for name in names]).T
         begin = np.array([(start or {}).get(n, v) for n, v in zip(names, begin, strict=True)])
 
         def of(values: Array) -> dict[str, float]:

@@ -183,8 +183,7 @@ def _fit(
     shortest = SHORTEST_DELAY if late > 0.0 else SHORTEST_LEAD
     if not taken_out and abs(late) >= max(shortest, 3.0 * doubt):
         # What was seen late would pass for damping and inertia.
-        earlier = log.seen_earlier(late, longest_gap)
-        return _fit(limb, earlier, groups, longest_gap, weight, late)
+        return _fit(limb, log.seen_earlier(late, longest_gap), groups, longest_gap, weight, late)
     warnings += at_bounds(fitted.free, fitted.values)
     found = _calibrated(fitted, limb, air, recorded)
     span = np.ptp(prepared.bend[prepared.usable], axis=0)

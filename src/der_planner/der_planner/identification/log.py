@@ -296,8 +296,7 @@ def _without_outliers(log: CalibrationLog, limb: Limb, warnings: list[str]) -> C
             "as where tags are lost: left out"
         )
         wrong["bend angles"], wrong["tips"] = wrong["bend angles"] | frozen, wrong["tips"] | frozen
-    tables = (log.measured_differential, log.bend_angles, log.tip)
-    pairs = zip(wrong.values(), tables, strict=True)
+    pairs = zip(wrong.values(), (log.measured_differential, log.bend_angles, log.tip), strict=True)
     pressures, bends, tips = (np.where(rows[:, None], np.nan, table) for rows, table in pairs)
     return replace(log, measured_differential=pressures, bend_angles=bends, tip=tips)
 

@@ -172,8 +172,7 @@ def check_run(segment_count: int, pressure: float) -> Excitation:
         fill[:held, valve // 2] = pressure * (1 - 2 * (valve % 2))
         rows.append(fill)
     table = np.concatenate(rows)
-    time = CONTROL_PERIOD * np.arange(len(table), dtype=np.float64)
-    return Excitation(time, table, "check")
+    return Excitation(CONTROL_PERIOD * np.arange(len(table), dtype=np.float64), table, "check")
 
 
 def find_rig(log: RigLog) -> RigFinding:

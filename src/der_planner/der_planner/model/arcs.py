@@ -70,8 +70,7 @@ class ArcFirstOrder:
         for k in range(count):
             raised = inputs[k * steps :][: len(shape)]
             raised[:, own, k, own] = shape[: len(raised)]
-        moved = self.tangent(inputs.reshape(count, steps, n, -1))[0]
-        return moved.reshape(count + 1, 2, count, n)
+        return self.tangent(inputs.reshape(count, steps, n, -1))[0].reshape(count + 1, 2, count, n)
 
 
 class ArcModel(Model):
@@ -213,8 +212,7 @@ class ArcModel(Model):
 
     def rest_slope(self, state: ArcState, _effective: Array) -> Array:
         """Return ∂angles/∂effective (n, n) [rad/Pa] of arcs at rest."""
-        matrix = self.stiffness_matrix(state.angles)
-        return np.asarray(np.linalg.solve(matrix, np.diag(self.gain)))
+        return np.asarray(np.linalg.solve(self.stiffness_matrix(state.angles), np.diag(self.gain)))
 
     def inverse_dynamics(
         self, angles: ArrayLike, rates: ArrayLike, accelerations: ArrayLike

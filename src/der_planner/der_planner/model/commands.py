@@ -45,8 +45,7 @@ def _drawn_out(air: Air, command: Array, period: float, time: Array, pressure: A
     How much of each ramp comes before its jump is chosen, segment by segment, by simulating the
     chambers under every share in `_SHARES_BEFORE`.
     """
-    instants = (np.arange(len(command)) + 0.5) * period
-    wanted = interpolate(instants, time, pressure)
+    wanted = interpolate((np.arange(len(command)) + 0.5) * period, time, pressure)
     step = air.pneumatics.slew_limit * period
     best, least = command, np.full(command.shape[1], np.inf)
     for share in _SHARES_BEFORE:

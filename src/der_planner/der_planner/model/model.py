@@ -116,8 +116,7 @@ class Model(ABC):
         Raises:
             LimbError: another model is asked for.
         """
-        seen = limb.for_model(name)
-        return Model.kinds[name](seen, nodes)
+        return Model.kinds[name](limb.for_model(name), nodes)
 
     def another(self: AnyModel, limb: Limb) -> AnyModel:
         """Return the same model of another limb."""

@@ -273,8 +273,7 @@ def step_middles(count: int, steps: int, period: float = CONTROL_PERIOD) -> Arra
 
 def means_between(pressure: Array, steps: int) -> Array:
     """Return (K − 1, S, M, …) means of the pressures (K, M, …) at both ends of each interval."""
-    middle = 0.5 * (pressure[1:] + pressure[:-1])
-    return np.repeat(middle[:, None], steps, axis=1)
+    return np.repeat((0.5 * (pressure[1:] + pressure[:-1]))[:, None], steps, axis=1)
 
 
 # Window by window along a known bend -----------------------------------------------------------

@@ -42,8 +42,7 @@ class LimbTwinNode(Node):
         moments = "of the chambers' moments, 1: as drawn; may be set at run time"
         read("gain", 1.0, moments, 0.0, 2.0, read_only=False)
         hoses = "chamber of each valve; minus: it bends the other way"
-        wiring = read("wiring", [1, 2, 3, 4], hoses)
-        self._wiring = Wiring(tuple(map(int, wiring)))
+        self._wiring = Wiring(tuple(map(int, read("wiring", [1, 2, 3, 4], hoses))))
         check_overrides(self)
         self._lock = threading.Lock()
         self._pressures: np.ndarray | None = None

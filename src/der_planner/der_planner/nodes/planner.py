@@ -314,6 +314,7 @@ class PlannerNode(Node):
                 self._corrector.follow(schedule, feedback)
             self._status = Status("streaming", plan_id, "; ".join(result.warnings))
             self._progress = 0.0
+            self._driver.newly_refused()
             self._output.plan(schedule)
         self.get_logger().info(
             f"plan {plan_id} planned in {result.solve_time:.2f} s: {schedule.count} setpoints over "
@@ -343,6 +344,8 @@ class PlannerNode(Node):
 
     def _ended(self, schedule: Schedule, outcome: str, reason: str) -> None:
         """Log how the playing of a plan ended, and tell who asked for it."""
+        if outcome == "finished" and (refused := self._driver.newly_refused()):
+            reason = f"the driver refused {refused} setpoints meanwhile: its log says why"
         reason = "; ".join(filter(None, [self._corrector.forget(schedule), reason]))
         text = f"plan {schedule.plan_id} {outcome} after {self._streamer.share(schedule)}"
         if outcome in _BY_DRIVER:
@@ -354,7 +357,7 @@ class PlannerNode(Node):
         else:
             self.get_logger().info(f"{text}: {reason}" if reason else text)
             if outcome == "finished" and self._status[:2] == ("streaming", schedule.plan_id):
-                self._status = Status("done", schedule.plan_id)
+                self._status = Status("done", schedule.plan_id, reason)
         self._action.end(schedule.plan_id, outcome, reason)
 
     def _now(self) -> int:

@@ -105,8 +105,7 @@ class _Corrected:
         """
         planned = self.schedule.plan.differential_pressure[index]
         limit = self.schedule.plan.limb.pneumatics.pressure_limit
-        wanted = self.feedback.allowed(planned + self._correction(index))
-        return np.clip(wanted, -limit, limit)
+        return np.clip(self.feedback.allowed(planned + self._correction(index)), -limit, limit)
 
     def _correction(self, index: int) -> Array:
         if self._left is not None:

@@ -276,8 +276,7 @@ def _request(
             f"feedback corrects plans of the rod, not of the model {model}: ask for der"
         )
     feedback = message.feedback or (options.feedback and model == "der")
-    plan_id = message.plan_id
-    return Request(plan_id, limb, motion, model, method, start, now, learned, feedback)
+    return Request(message.plan_id, limb, motion, model, method, start, now, learned, feedback)
 
 
 # The action --------------------------------------------------------------------------------------

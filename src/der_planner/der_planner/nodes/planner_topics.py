@@ -238,6 +238,7 @@ class DriverWatch:
         self._mode: int | None = None
         self._faults: list[str] = []
         self._heard = 0.0
+        self._refused = self._counted = 0
         self._told_to_vent = False
 
     @property
@@ -259,6 +260,7 @@ class DriverWatch:
         with self._changed:
             before, self._mode = self._mode, int(state.mode)
             self._faults, self._heard = list(state.faults), self._steady()
+            self._refused = int(state.setpoints_refused)
             begins = self._mode == PressureState.VENTING and before != self._mode
             if begins:
                 self._told_to_vent = before != PressureState.HOLDING
@@ -269,6 +271,12 @@ class DriverWatch:
             return Ending("vented", f"the driver was told to vent: {_REMEDY}")
         stopped = self._mode in (PressureState.DISARMED, PressureState.FAULT)
         return self.obstacle() if stopped else None
+
+    def newly_refused(self) -> int:
+        """Return how many setpoints the driver has refused since this was asked last."""
+        with self._changed:
+            before, self._counted = self._counted, self._refused
+            return max(self._counted - before, 0)
 
     def obstacle(self) -> Ending | None:
         """Return why the driver takes no setpoints now; None if it does, or was never heard."""

@@ -79,8 +79,8 @@ def describe_limb(driver: dict[str, Any] | None) -> str:
     if driver is None:
         return "in an unknown state"
     measured, commanded = driver["measured_kpa"], driver["commanded_kpa"]
-    known = [abs(value) for value in (*measured, *commanded) if value is not None]
-    largest = max(known, default=0.0)
+    told = (*measured, *commanded, driver["highest_kpa"])
+    largest = max([abs(value) for value in told if value is not None], default=0.0)
     if largest > PRESSED * driver["limit_kpa"]:
         return f"under pressure ({largest:.1f} kPa)"
     return "of unknown pressure" if not measured or None in measured else WITHOUT_PRESSURE

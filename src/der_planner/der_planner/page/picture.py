@@ -122,8 +122,7 @@ def _encode(grey: NDArray[np.uint8], width: int) -> bytes:
     if width < full:
         size = (width, max(1, round(height * width / full)))
         grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
-    data = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]
-    return data.tobytes()
+    return cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
 
 
 class Overlay:

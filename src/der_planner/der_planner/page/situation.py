@@ -20,7 +20,7 @@ from rcl_interfaces.msg import Log
 from der_msgs.msg import LimbContact, LimbEstimate, LimbState, PressurePlan, PressureState
 from der_planner.limb import mounting_of
 from der_planner.page.alarm import LATE, NODES, alarms, describe_limb, missing, worst_first
-from limb_interfaces.diagnostics import ENDED_IN_ORDER
+from limb_interfaces.diagnostics import ENDED_IN_ORDER, highest_gauge
 from limb_interfaces.stamps import NANOSECONDS, nanoseconds
 from pressure_driver.protocols import USUAL_LIMIT
 
@@ -94,9 +94,9 @@ class Situation:
         """Take the driver's state."""
         known = dict(enumerate(MODES.items()))
         mode, meaning = known.get(message.mode, (f"unknown mode {message.mode}", "unknown"))
-        measured = message.measured_differential
+        measured, highest = message.measured_differential, highest_gauge(message)
         if not message.telemetry_age <= FRESH["driver"]:  # the board's last ones, maybe of long ago
-            measured = [math.nan] * len(measured)
+            measured, highest = [math.nan] * len(measured), math.nan
         values = {
             "mode": mode,
             "meaning": meaning,
@@ -104,6 +104,7 @@ class Situation:
             "plan_id": message.plan_id,
             "commanded_kpa": _kilopascal(message.commanded_differential),
             "measured_kpa": _kilopascal(measured),
+            "highest_kpa": _number(highest / PASCAL_PER_KILOPASCAL, 3),
             "limit_kpa": self.limit / PASCAL_PER_KILOPASCAL,
             "supply_kpa": _number(message.supply_pressure / PASCAL_PER_KILOPASCAL, 1),
             "telemetry_age": _number(message.telemetry_age, 2),

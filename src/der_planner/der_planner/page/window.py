@@ -176,8 +176,7 @@ class OperatorWindow:
 
     async def _on_record(self) -> None:
         if self._may_do("record"):
-            answer = await self._parts.commands.record(str(self._note.value or ""))
-            self._show("record", answer)
+            self._show("record", await self._parts.commands.record(str(self._note.value or "")))
 
     async def _on_play(self) -> None:
         if not self._may_do("play"):

@@ -234,8 +234,7 @@ class Motion:
             state = (start.bend_angles, start.rate, start.acceleration)
             time, angles = led_in(fastest, state, time, angles)
         spline = resting_spline(time, angles, start)
-        count = round(time[-1] / CONTROL_PERIOD) + 1
-        instants = np.arange(count) * CONTROL_PERIOD
+        instants = np.arange(round(time[-1] / CONTROL_PERIOD) + 1) * CONTROL_PERIOD
         sampled = sample_spline(spline, instants)[0]
         tip = workspace.arcs.tip(sampled) + rest.offset
         if workspace.sags:

@@ -188,8 +188,7 @@ class Obstacles:
         sides = out[np.arange(len(out)), closest]
         inside = (clearance[:-1] < 0.0) & (clearance[1:] < 0.0)
         passes = bool(np.any(inside & (np.sum(sides[:-1] * sides[1:], axis=1) < 0.0)))
-        place = float(along + points[k, 0, 0])
-        return Nearest(float(clearance[k]), k, place, sides[k], passes)
+        return Nearest(float(clearance[k]), k, float(along + points[k, 0, 0]), sides[k], passes)
 
     def check_rest(self, model: RodModel, curve: Array, bend: Array) -> None:
         """Refuse numbers in another unit, and obstacles where the limb rests.

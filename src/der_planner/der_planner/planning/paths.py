@@ -184,8 +184,7 @@ def draw_shape(
     axes = radius * np.array([along, [-along[1], along[0]]])
     if name in ("line", "star"):
         corners = centre + _corners(name) @ axes
-        loop = np.concatenate([corners] + [corners[1:]] * (cycles - 1))
-        return polygon(loop, period * cycles)
+        return polygon(np.concatenate([corners] + [corners[1:]] * (cycles - 1)), period * cycles)
     total = period * cycles
     time = np.linspace(0.0, total + period / 4, _SHAPE_POINTS * 4 * cycles + 1)
     phase = 2 * np.pi * _faded_phase(time / period, cycles)

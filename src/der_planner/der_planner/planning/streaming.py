@@ -46,8 +46,7 @@ class Schedule:
         if not 0 < index < self.count:
             return None
         angles, rate, acceleration = self.plan.reference.sample(self.plan.time[index])
-        before = self.plan.differential_pressure[index - 1]
-        return Start(angles, rate, acceleration, before)
+        return Start(angles, rate, acceleration, self.plan.differential_pressure[index - 1])
 
     @property
     def count(self) -> int:
@@ -63,8 +62,7 @@ def first_stamp(now: int, lead: int, wanted: int = 0) -> int:
         lead: how long before its stamp a setpoint is sent [ns].
         wanted: instant asked for [ns]; 0 or one that cannot be met: as soon as possible.
     """
-    earliest = max(now + lead, wanted)
-    return -(-earliest // GRID) * GRID
+    return -(-max(now + lead, wanted) // GRID) * GRID
 
 
 @dataclass(frozen=True)

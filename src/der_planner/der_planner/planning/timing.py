@@ -142,8 +142,7 @@ def smooth_step(x: ArrayLike) -> Array:
 
 def quintic(time: Array, begin: Moving, end: Moving) -> Array:
     """Return (K, M) samples of the quintic between two states over the span of ``time`` (K,)."""
-    between = BPoly.from_derivatives([0.0, time[-1]], np.array([begin, end]))
-    return np.asarray(between(time))
+    return np.asarray(BPoly.from_derivatives([0.0, time[-1]], np.array([begin, end]))(time))
 
 
 def on_grid(span: float) -> float:

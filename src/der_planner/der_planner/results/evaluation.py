@@ -40,6 +40,8 @@ DRAWN = "drawn_path_m"
 NEAREST = ", nearest path"
 """Ends the name of such a run's motion."""
 REFERENCE_POINTS = 25
+OTHER_COMMAND = 0.1
+"""Commands that differ from the setpoints by this share of the largest setpoint are others."""
 LARGEST_AHEAD = 1e-3
 """Stamps may be this far [s] from the future in such a run."""
 
@@ -163,8 +165,7 @@ def _gaps(stamps: Array, valid: Array, first: float, last: float) -> tuple[int, 
     dropped = 0
     if len(steps):
         dropped = int(np.sum(np.maximum(0, np.rint(steps / np.median(steps)) - 1)))
-    edges = np.concatenate([[first], valid, [last]])
-    return dropped, float(np.diff(edges).max())
+    return dropped, float(np.diff(np.concatenate([[first], valid, [last]])).max())
 
 
 def _reference_points(run: RunSeries, first: float, last: float) -> tuple[tuple[float, float], ...]:
@@ -176,8 +177,7 @@ def _reference_points(run: RunSeries, first: float, last: float) -> tuple[tuple[
 def _predicted_error(run: RunSeries) -> float:
     if not len(run.predicted):
         return float("nan")
-    distance = np.linalg.norm(run.predicted.value - run.reference.value, axis=1)
-    return float(distance.mean())
+    return float(np.linalg.norm(run.predicted.value - run.reference.value, axis=1).mean())
 
 
 def _pressure_errors(run: RunSeries, first: float, last: float) -> tuple[float, ...]:
@@ -191,6 +191,16 @@ def _pressure_errors(run: RunSeries, first: float, last: float) -> tuple[float, 
     return tuple(np.sqrt(np.nanmean(difference**2, axis=0)).tolist())
 
 
+def _other_commands(run: RunSeries) -> float:
+    """Return the share of the driver's ticks at which it did not command the plan's setpoint."""
+    if not len(run.setpoints) or not len(run.commanded):
+        return 0.0
+    ticks = run.commanded.between(*run.setpoints.time[[0, -1]])
+    apart = np.abs(ticks.value - run.setpoints.at(ticks.time)).max(axis=1)
+    others = apart > OTHER_COMMAND * np.abs(run.setpoints.value).max()
+    return float(others.sum()) / max(1, len(ticks))
+
+
 def _problems(run: RunSeries, valid: float, longest: float) -> tuple[str, ...]:
     found = [f"the driver reported a fault: {text}" for text in run.faults]
     found += [f"something touched the limb {text}" for text in run.touches]
@@ -200,6 +210,10 @@ def _problems(run: RunSeries, valid: float, longest: float) -> tuple[str, ...]:
         found.append(f"only {valid:.0%} of the images have a valid limb state")
     if longest > GAP:
         found.append(f"{longest:.1f} s without a valid limb state")
+    if (others := _other_commands(run)) > 1.0 - LEAST_VALID:
+        found.append(
+            f"for {others:.0%} of the time the driver commanded other pressures: see its log"
+        )
     if run.ahead > LARGEST_AHEAD:
         found.append(f"stamps come from up to {1e3 * run.ahead:.0f} ms in the future: see `clocks`")
     return tuple(found)

@@ -188,8 +188,7 @@ def mean_error(runs: Sequence[RunSeries]) -> tuple[Array, Array, Array]:
     A gap in one run does not count there: at each instant the mean is over the runs that have a
     valid image within 0.1 s. The deviation is 0 where only one has.
     """
-    last = min(float(run.reference.time[-1]) for run in runs)
-    grid = np.arange(0.0, last, 0.05)
+    grid = np.arange(0.0, min(float(run.reference.time[-1]) for run in runs), 0.05)
     rows = np.full((len(runs), len(grid)), np.nan)
     for row, run in zip(rows, runs, strict=True):
         series = error_series(run)

@@ -210,8 +210,7 @@ def _film_frame(shot: Snapshot, time: float, run: RunSeries, project: Projection
         cv2.circle(picture, tip, 11, paint, -1, cv2.LINE_AA)
     draw(shot.planned, white, 2)
     if 0.0 <= time <= run.reference.time[-1]:
-        asked = run.reference.at(np.array([time]))
-        centre = np.rint(project(asked))[0].astype(int).tolist()
+        centre = np.rint(project(run.reference.at(np.array([time]))))[0].astype(int).tolist()
         cv2.circle(picture, centre, 13, white, 2, cv2.LINE_AA)
     text = f"{run.description.motion} {run.description.model}  {time:6.2f} s"
     cv2.putText(picture, text, (16, 32), cv2.FONT_HERSHEY_SIMPLEX, 0.8, white, 2)

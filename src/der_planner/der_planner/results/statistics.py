@@ -245,8 +245,7 @@ def learning_curves(results: Sequence[RunResult]) -> dict[str, list[tuple[str, l
     trials: dict[tuple[str, str, int, str], dict[int, float]] = {}
     for result in results:
         # "learned 2 + feedback": what was played beside the plan makes a curve of its own.
-        beside = result.method.partition("+")[2]
-        key = (result.motion, result.model, result.trial, beside)
+        key = (result.motion, result.model, result.trial, result.method.partition("+")[2])
         trials.setdefault(key, {})[learned_from(result.method)] = result.mean_error_m
     curves: dict[str, list[tuple[str, list[float]]]] = {}
     for (motion, model, *_), errors in trials.items():

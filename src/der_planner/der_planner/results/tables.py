@@ -76,8 +76,7 @@ class Table:
         for name, *cells in self.rows:
             if last and name != last:
                 lines.append(r"\addlinespace")
-            shown = ["" if name == last else name, *cells]
-            lines.append(" & ".join(map(_latex, shown)) + r" \\")
+            lines.append(" & ".join(map(_latex, ["" if name == last else name, *cells])) + r" \\")
             last = name
         return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", ""])
 

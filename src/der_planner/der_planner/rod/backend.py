@@ -49,8 +49,7 @@ class RodState:
 def positions_of(q: Array) -> Array:
     """Return the (…, N, 3) node positions of (…, 4N-1) configurations."""
     padded = np.concatenate([q, np.zeros((*q.shape[:-1], 1))], axis=-1)
-    nodes = padded.shape[-1] // 4
-    return padded.reshape(*q.shape[:-1], nodes, 4)[..., :3].copy()
+    return padded.reshape(*q.shape[:-1], padded.shape[-1] // 4, 4)[..., :3].copy()
 
 
 class ConvergenceError(RuntimeError):

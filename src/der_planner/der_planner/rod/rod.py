@@ -234,8 +234,7 @@ class Rod:
             ConvergenceError: Newton's iteration failed.
         """
         pressures = array(u, (self.segment_count,), "u")[None]
-        motion = self.simulate(state, pressures, dt, method=method, forces=forces, halvings=0)
-        return motion.final
+        return self.simulate(state, pressures, dt, method=method, forces=forces, halvings=0).final
 
     def simulate(
         self,

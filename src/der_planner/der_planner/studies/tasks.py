@@ -274,8 +274,7 @@ _RECOVERED = (
 
 def _identify(limb: str, row: Mapping[str, Any]) -> Result:
     """Compare what a calibration found with what the seed drew, and predict an unseen motion."""
-    prior = limb_of(limb)
-    found, report = Twin.of(row).fit(prior)
+    found, report = Twin.of(row).fit(limb_of(limb))
     distances: dict[str, list[float]] = {}
     for name, known in known_values(draw(row["seed"])).items():
         unknown = report.value(name)

@@ -243,8 +243,7 @@ class NodeLoads:
             )
         if math.isnan(push.instant) or not push.duration > 0:
             raise TwinError(f"a push needs an instant and a duration above 0 s, got {push}")
-        shares = self._shares(push.arc_length)
-        hung = [*self._pushes, (push, shares)]
+        hung = [*self._pushes, (push, self._shares(push.arc_length))]
         if np.any(self._own_mass + sum(each.mass * borne for each, borne in hung) <= 0.0):
             raise TwinError(f"there is no mass of {-push.mass} kg at {push.arc_length} m to take")
         self._pushes = hung

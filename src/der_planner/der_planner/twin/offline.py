@@ -137,8 +137,7 @@ def play(
         TwinError: the arrays do not fit together or to the twin, or a load is not on the limb.
     """
     instants, wanted = _checked(time, differential_pressure)
-    count = wanted.shape[1]
-    limb = OfflineTwin(seed, run, segment_count=count, gravity=gravity, masses=masses)
+    limb = OfflineTwin(seed, run, segment_count=wanted.shape[1], gravity=gravity, masses=masses)
     tip = np.empty((instants.size, 2))
     angles, chambers = np.empty_like(wanted), np.empty((instants.size, 2 * wanted.shape[1]))
     for push in pushes:
