@@ -13,8 +13,9 @@ model's effective pressure under the *measured* chamber pressures and w̄ under 
     M_w δθ̈ = s ((w − w̄) + d + g w − D_w δθ̇ − K_w δθ)
 
 Where the limb rests, s changes nothing; how quickly it swings tells s. Corrections for a limb that
-swings otherwise than expected would come in the wrong phase, and drive it. d, g and b wander. Friction and creep remember the model's bend and the slow part of δθ: the noise
-of a measurement must not wear off what friction remembers.
+swings otherwise than expected would come in the wrong phase, and drive it. d, g and b wander.
+Friction and creep remember the model's bend and the slow part of δθ: the noise of a measurement
+must not wear off what friction remembers.
 
 Measurements come late and in any order. The filter runs on a grid of `nominal.STEP` and keeps its
 states of the last seconds; a measurement is put at its own instant, against the model at exactly
