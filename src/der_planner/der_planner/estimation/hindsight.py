@@ -196,10 +196,12 @@ def _backward(estimator: Estimator, last: int) -> Smoothed:
             rows.append((mean, spread))
     time = np.arange(len(rows), dtype=np.float64) * CONTROL_PERIOD
     means, spreads = (np.array(column[::-1]) for column in zip(*rows, strict=True))
-    parts = np.arange(1, 5) * estimator.inputs
-    change, speed, missing, gains, offset = np.split(means[:, :-1], parts, axis=1)
+    inputs = estimator.inputs
+    change, speed, missing, gains, offset = np.split(
+        means[:, :-1], np.arange(1, 5) * inputs, axis=1
+    )
     bend, rate, tip = nominal.at(time)
-    outputs = [estimator.output(b, c)[estimator.inputs :] for b, c in zip(bend, change, strict=True)]
+    outputs = [estimator.output(b, c)[inputs:] for b, c in zip(bend, change, strict=True)]
     squares = [(square, count) for when, square, count in estimator.innovations if when >= 0]
     return Smoothed(
         time=time,
