@@ -20,7 +20,7 @@ Keys = webdriver.Keys
 pytestmark = [pytest.mark.graph, NEEDS_CHROMIUM]
 PRESS = """
 const button = document.getElementById(arguments[0]);
-if (!button || button.disabled) return false;
+if (!window.did_handshake || !button || button.disabled) return false;
 button.click();
 return true;
 """
@@ -65,12 +65,12 @@ def rig(running: WatchedPage) -> Iterator[WatchedPage]:
 
 
 def enabled(browser: Any, name: str) -> bool:
-    script = "return !document.getElementById(arguments[0])?.disabled;"
+    script = "return document.getElementById(arguments[0])?.disabled === false;"
     return bool(browser.execute_script(script, name))
 
 
 def press(rig: WatchedPage, browser: Any, name: str) -> None:
-    """Press a button once it is enabled; the framework may draw it anew at any time."""
+    """Press a button once it is enabled and heard; it may be drawn anew at any time."""
     rig.wait(lambda: browser.execute_script(PRESS, name), f"the button {name}")
 
 
@@ -92,7 +92,7 @@ def test_one_arms_and_everybody_vents(rig: WatchedPage) -> None:
     press(rig, first, "take")
     arm(rig, first)
     first.refresh()  # the same tab of the same browser: nobody is lost
-    rig.wait(lambda: first.find_elements("id", "arm") and enabled(first, "arm"), "the operator")
+    rig.wait(lambda: enabled(first, "arm"), "the operator")
     rig.wait(lambda: not enabled(second, "take"), "the second window to see the first one command")
     assert not enabled(second, "arm")
 
