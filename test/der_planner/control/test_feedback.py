@@ -354,10 +354,16 @@ def test_a_wrong_shape_is_refused(planned):
     feedback = Feedback(planned)
     with pytest.raises(ValueError, match="2 bend angles"):
         feedback.measure(0.0, [0.0], [0.0, 0.0])
+    with pytest.raises(ValueError, match="2 bend angles"):
+        feedback.measure(0.0, [0.0, 0.0, 0.0], [0.0])
     with pytest.raises(ValueError, match="covariance"):
         feedback.measure(0.0, [0.0, 0.0], [0.0, 0.0], np.eye(3))
-    with pytest.raises(ValueError, match="variances that are not negative"):
-        feedback.measure(0.0, [0.0, 0.0], [0.0, 0.0], -np.eye(2))
+    for wrong in (-np.eye(2), [[1e-8, 1.0], [1.0, 1e-8]]):
+        with pytest.raises(ValueError, match="variances that are not negative"):
+            feedback.measure(0.0, [0.0, 0.0], [0.0, 0.0], wrong)
+    for command in ([0.0], [np.nan, 0.0]):
+        with pytest.raises(ValueError, match="one pressure a segment"):
+            feedback.sent(0.0, command)
     with pytest.raises(ValueError, match="2 differential pressures"):
         feedback.pressures(0.0, [0.0])
 

@@ -242,6 +242,7 @@ def test_a_file_says_what_is_wrong_with_it(tmp_path):
     for text, said in (
         ("limb_radius_m: 0.01\nobstacles: [{radius_m: 0.01}]\n", "an obstacle has"),
         ("limb_radius_m: -1\nobstacles: []\n", "0 or more"),
+        ("limb_radius_m: 8 mm\nobstacles: []\n", "limb_radius_m must be a number, got 8 mm"),
         ("obstacles: []\n", "limb_radius_m"),
         ("limb_radius_m: 0.01\nobstacles: [{half_plane_m: [0, 0], normal: [0, 0]}]", "direction"),
     ):

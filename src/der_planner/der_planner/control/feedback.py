@@ -256,8 +256,10 @@ class Feedback:
     def sent(self, time: float, command: ArrayLike) -> None:
         """Tell that another command (M,) [Pa] was sent for an instant [s] than was asked for."""
         self._check(time)
-        k = round(time / CONTROL_PERIOD)
-        self._chambers.send(k, np.asarray(command, dtype=float))
+        k, values = round(time / CONTROL_PERIOD), np.asarray(command, dtype=float)
+        if values.shape != self._nominal.command(k).shape or not np.isfinite(values).all():
+            raise ValueError(f"expected a command of one pressure a segment, got {values.tolist()}")
+        self._chambers.send(k, values)
         self._estimator.changed(k * CONTROL_PERIOD)
 
     def late(self, time: float, by: float) -> None:

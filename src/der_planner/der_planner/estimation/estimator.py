@@ -151,12 +151,12 @@ class Estimator:
         self, time: float, bend_angle: ArrayLike, tip: ArrayLike, covariance: ArrayLike | None
     ) -> None:
         """Take in a measurement at its own instant [s]; NaN: not seen. See `Feedback.measure`."""
-        value = np.concatenate([np.ravel(bend_angle), np.ravel(tip)]).astype(float)
-        if value.shape != (self.inputs + 2,):
+        if np.shape(bend_angle) != (self.inputs,) or np.shape(tip) != (2,):
             raise ValueError(
                 f"expected {self.inputs} bend angles and a tip (2,), got shapes "
                 f"{np.shape(bend_angle)} and {np.shape(tip)}"
             )
+        value = np.concatenate([bend_angle, tip]).astype(float)
         if not np.isfinite(value).any():
             return
         self.begin(time)
@@ -173,7 +173,7 @@ class Estimator:
         noise = np.diag(np.repeat(np.square(_NOISE), [self.inputs, 2]))
         given = noise if covariance is None else np.asarray(covariance, dtype=float)
         if given.shape not in ((2, 2), noise.shape) or not (
-            np.isfinite(given).all() and (np.diagonal(given) >= 0.0).all()
+            np.isfinite(given).all() and np.linalg.eigvalsh(given)[0] >= -1e-9 * np.trace(given)
         ):
             raise ValueError(
                 f"covariance must be that of the tip (2, 2) or of bend angles and tip "

@@ -17,7 +17,7 @@ So is one in which the limb would come out on the obstacle's other side, whateve
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -318,10 +318,11 @@ def _obstacle(item: Any) -> Obstacle:
     keys = set(item) if isinstance(item, Mapping) else set()
     allowed = _number(item.get("allowed_force_n", 0.0), "allowed_force_n") if keys else 0.0
     if {"circle_m", "radius_m"} <= keys <= _CIRCLE:
-        radius, centre = _number(item["radius_m"], "radius_m"), _pair(item["circle_m"], "circle_m")
+        radius = _number(item["radius_m"], "radius_m")
+        centre = _finite(item["circle_m"], (2,), "circle_m")
         return Obstacle(centre, radius, allowed, f"the circle at {place_of(centre)}")
     if {"half_plane_m", "normal"} <= keys <= _HALF_PLANE:
-        edge, normal = _pair(item["half_plane_m"], "half_plane_m"), _pair(item["normal"], "normal")
+        edge, normal = (_finite(item[key], (2,), key) for key in ("half_plane_m", "normal"))
         size = float(np.linalg.norm(normal))
         if size == 0.0:
             raise ValueError("the normal of a half-plane has a direction")
@@ -334,14 +335,18 @@ def _obstacle(item: Any) -> Obstacle:
 
 
 def _number(value: Any, name: str) -> float:
-    number = float(value)
-    if not (math.isfinite(number) and number >= 0.0):
+    number = float(_finite(value, (), name))
+    if number < 0.0:
         raise ValueError(f"{name} must be 0 or more, got {value}")
     return number
 
 
-def _pair(value: Sequence[float], name: str) -> Array:
-    pair = np.array(value, dtype=float)
-    if pair.shape != (2,) or not np.isfinite(pair).all():
-        raise ValueError(f"{name} must be two numbers x, y, got {value}")
-    return pair
+def _finite(value: Any, shape: tuple[int, ...], name: str) -> Array:
+    try:
+        numbers = np.array(value, dtype=float)
+    except (TypeError, ValueError):
+        numbers = np.array(np.nan)
+    if numbers.shape != shape or not np.isfinite(numbers).all():
+        kind = "two numbers x, y" if shape else "a number"
+        raise ValueError(f"{name} must be {kind}, got {value}")
+    return numbers
