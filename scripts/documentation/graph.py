@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import tempfile
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -103,10 +104,10 @@ def _quality(ends: list[Any], name: str) -> str:
 
 def _asked(client: GraphClient, kind: Any, service: str, **request: Any) -> Any:
     """Return an answer; one that is lost is asked for again, which does no harm here."""
-    try:
-        return client.ask(kind, service, timeout=5.0, **request)
-    except GraphError:
-        return client.ask(kind, service, **request)
+    for _ in range(9):
+        with suppress(GraphError):
+            return client.ask(kind, service, timeout=5.0, **request)
+    return client.ask(kind, service, **request)
 
 
 def _parameters(client: GraphClient, name: str, given: dict[str, Any]) -> list[dict[str, Any]]:
