@@ -76,6 +76,7 @@ class OperatorWindow:
             with self._panel("numbers", "Last 30 s", "driver"):
                 add_curves(parts.previewer.limb.segment_count)
             self._panel("nodes", "Nodes")
+        self._show_desk()
         ui.timer(DESK_INTERVAL, self._show_desk)
         ui.timer(LEARNED_INTERVAL, lambda: self._form.offer(parts.commands.learned_plans()))
 
