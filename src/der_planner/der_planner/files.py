@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import io
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
+from numpy.typing import ArrayLike
 
 
 class _Dumper(yaml.SafeDumper):
@@ -29,6 +32,13 @@ def write_whole(path: str | Path, text: str) -> None:
     unfinished = file.with_name(f".{file.name}.part")
     unfinished.write_text(text, encoding="utf-8")
     unfinished.replace(file)
+
+
+def write_columns(path: str | Path, columns: Mapping[str, ArrayLike]) -> None:
+    """Write a table (CSV), as `write_whole` does: under each name its column (K,)."""
+    text, table = io.StringIO(), np.column_stack([np.asarray(each) for each in columns.values()])
+    np.savetxt(text, table, delimiter=",", header=",".join(columns), comments="", fmt="%.10g")
+    write_whole(path, text.getvalue())
 
 
 def yaml_text(content: Any, **style: Any) -> str:

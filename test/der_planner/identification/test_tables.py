@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from der_planner.identification import CalibrationLog, ColumnMap, LogError, read_csv
-from der_planner.identification.excitation import read_excitation
+from der_planner.identification.excitation import Excitation, read_excitation, write_excitation
 from der_planner.identification.log import prepare
 from der_planner.limb import Limb
 
@@ -174,6 +174,13 @@ def test_each_log_finds_its_own_rest_even_if_it_is_not_exactly_zero(tmp_path, re
         np.testing.assert_allclose(log.measured_differential[resting], 0.0, atol=1e-6)
     with pytest.raises(LogError, match="no row at rest: its commands never come"):
         read_csv(lab_log(tmp_path / "never.csv", 70.0, 80.0), columns)
+
+
+def test_an_excitation_is_written_into_a_new_folder_and_read_back(tmp_path):
+    pressure = np.array([[0.0, 1.5], [-2000.25, 7e3]])
+    write_excitation(Excitation(np.array([0.0, 0.05]), pressure), tmp_path / "new" / "table.csv")
+    read = read_excitation(tmp_path / "new" / "table.csv", 2)
+    np.testing.assert_array_equal(read.differential_pressure, pressure)
 
 
 def test_an_excitation_of_another_grid_or_limb_is_refused(tmp_path):

@@ -20,6 +20,7 @@ from der_planner.arrays import Array
 from der_planner.commands.learn import FAILURES, add_plan_options, in_hindsight, plan_of
 from der_planner.estimation.hindsight import Smoothed, smooth
 from der_planner.experiment.console import check_file, command
+from der_planner.files import write_columns
 from der_planner.results import RunSeries, load_run
 
 
@@ -81,5 +82,4 @@ def write_table(smoothed: Smoothed, path: Path) -> None:
         for i in range(size):
             columns[f"{name}_{i}{unit}"] = values[:, i]
             columns[f"{name}_{i}_sigma{unit}"] = smoothed.deviation[:, place * size + i]
-    table = np.column_stack(list(columns.values()))
-    np.savetxt(path, table, delimiter=",", header=",".join(columns), comments="", fmt="%.9g")
+    write_columns(path, columns)

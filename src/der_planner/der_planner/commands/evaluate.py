@@ -70,7 +70,7 @@ def expand(paths: list[Path]) -> list[Path]:
     return found
 
 
-@command(*FAILURES, OSError)
+@command(*FAILURES)
 def main(parser: argparse.ArgumentParser) -> int:
     """Run the command line; 0 when every bag was evaluated, 1 otherwise."""
     given = _options(parser)

@@ -29,8 +29,8 @@ from der_planner.planning.plan_file import read_plan, write_plan
 from der_planner.results import BagError, EvaluationError, RunSeries, load_run
 from der_planner.results.evaluation import DRAWN
 
-FAILURES = (BagError, EvaluationError, LearningError, LimbError, PlanningError)
-"""What a bag, a limb file or a plan may be lacking."""
+FAILURES = (BagError, EvaluationError, LearningError, LimbError, PlanningError, OSError)
+"""What a bag, a limb file, a plan or a disk may be lacking."""
 Verdict = TypeVar("Verdict")
 _SAME_POINT = 2e-3
 """References whose points lie further apart than this [m] are not of one motion."""

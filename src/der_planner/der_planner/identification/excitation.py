@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from der_planner.arrays import Array
+from der_planner.files import write_columns
 from der_planner.identification.fit import fit
 from der_planner.identification.log import CalibrationLog, LogError
 from der_planner.identification.report import FitReport
@@ -61,10 +62,9 @@ class Excitation:
 
 def write_excitation(excitation: Excitation, path: Path) -> None:
     """Write a run as CSV: time_s and one column of pressures [Pa] a segment."""
-    table = np.column_stack([excitation.time, excitation.differential_pressure])
-    names = [f"differential_pressure_{i}_Pa" for i in range(table.shape[1] - 1)]
-    header = ",".join(["time_s", *names])
-    np.savetxt(path, table, delimiter=",", header=header, comments="", fmt="%.10g")
+    segments = enumerate(excitation.differential_pressure.T)
+    pressures = {f"differential_pressure_{i}_Pa": column for i, column in segments}
+    write_columns(path, {"time_s": excitation.time, **pressures})
 
 
 def read_excitation(path: Path, segment_count: int) -> Excitation:

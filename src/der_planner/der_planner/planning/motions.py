@@ -114,8 +114,8 @@ class Motion:
     """
 
     name: str
-    amplitude: float = 0.0
-    period: float = 0.0
+    amplitude: float
+    period: float
     cycles: int = 1
     path: paths.TipPath | None = None
     branch: str = ""
@@ -197,9 +197,9 @@ class Motion:
         check_branch(branch)
         if nearest and time is None:
             drawn, limits = line(paths.checked_points(tip)), limits or PathLimits()
-            return cls(name, path=drawn, branch=branch, nearest=True, limits=limits)
+            return cls(name, 0.0, 0.0, path=drawn, branch=branch, nearest=True, limits=limits)
         path = paths.TipPath.build(time, tip, limits)
-        return cls(name, path=path, branch=branch, nearest=nearest)
+        return cls(name, 0.0, 0.0, path=path, branch=branch, nearest=nearest)
 
     @classmethod
     def from_csv(cls, path: str | Path, nearest: bool = False) -> Motion:
