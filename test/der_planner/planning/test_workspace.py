@@ -197,7 +197,9 @@ def test_no_allowed_force_leads_a_limb_through_a_peg(free, method):
     k = most_bent(free)
     half_way = (free.curve(0) + free.curve(k))[len(free.curve(k)) * 4 // 5] / 2
     with pytest.raises(ObstacleError, match="which no force brings about"):
-        plan(LIMB, MOTION, method=method, obstacles=circle(half_way, allowed=100.0))
+        plan(LIMB, MOTION, method=method, obstacles=circle(half_way, allowed=5.0))
+    with pytest.raises(PlanningError, match="be touched with 200 N, and"):
+        plan(LIMB, MOTION, method=method, obstacles=circle(half_way, allowed=200.0))
 
 
 @pytest.mark.parametrize("mounting", ["horizontal", "sideways"])

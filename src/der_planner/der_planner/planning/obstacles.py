@@ -45,7 +45,8 @@ _SMOOTHED = 4.0
 _NEARNESS = 1e-3
 """Tip error that a unit change of a bend angle is worth there [m/rad]."""
 _FAR = 10.0
-"""Distance from the clamp, over the limb's length, beyond which a number is not in metres."""
+"""Distance from the clamp, over the limb's length, and force, over what the limb's tip presses with
+at most, beyond which a number has another unit."""
 
 
 @dataclass(frozen=True)
@@ -201,8 +202,14 @@ class Obstacles:
         Raises:
             PlanningError: names what cannot be, and the remedy.
         """
-        length = model.limb.length
+        limb, length = model.limb, model.limb.length
+        moment = max(each.moment_gain for each in limb.segments) * limb.pneumatics.pressure_limit
         for each in self.items:
+            if each.allowed_force > _FAR * moment / length:
+                raise PlanningError(
+                    f"{each} may be touched with {each.allowed_force:g} N, and the tip presses "
+                    f"with some {moment / length:.2g} N at most: give N"
+                )
             if abs(each.away(np.zeros(2))[0]) > _FAR * length:
                 raise PlanningError(
                     f"{each} in the file of obstacles is far too large for a limb of {length:.3g} "
