@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import yaml
-from numpy.typing import ArrayLike
+from numpy.typing import NDArray
 
 
 class _Dumper(yaml.SafeDumper):
@@ -34,9 +34,9 @@ def write_whole(path: str | Path, text: str) -> None:
     unfinished.replace(file)
 
 
-def write_columns(path: str | Path, columns: Mapping[str, ArrayLike]) -> None:
+def write_columns(path: str | Path, columns: Mapping[str, NDArray[np.float64]]) -> None:
     """Write a table (CSV), as `write_whole` does: under each name its column (K,)."""
-    text, table = io.StringIO(), np.column_stack([np.asarray(each) for each in columns.values()])
+    text, table = io.StringIO(), np.column_stack(list(columns.values()))
     np.savetxt(text, table, delimiter=",", header=",".join(columns), comments="", fmt="%.10g")
     write_whole(path, text.getvalue())
 

@@ -107,9 +107,7 @@ def locate(model: RodModel, lacking: Lacking, places: Array) -> Touch:
     weight = np.linalg.inv(lacking.doubtful + np.diag(doubt**2))
     seen = np.swapaxes(effect, 1, 2) @ weight
     square, pull = seen @ effect, seen @ lacking.value
-    limb = model.limb
-    gain = max(segment.moment_gain for segment in limb.segments)
-    usual = gain * limb.pneumatics.pressure_limit / limb.length
+    usual = model.limb.tip_force
     largest = _LARGEST_FORCE * usual
     across = pull[:, 1] / (square[:, 1, 1] + largest**-2)
     expected = np.full_like(pull, largest)

@@ -136,6 +136,12 @@ class Limb:
         return any(self.gravity[:2])
 
     @property
+    def tip_force(self) -> float:
+        """What the strongest segment, at the pressure limit, presses with at the tip [N]."""
+        gain = max(segment.moment_gain for segment in self.segments)
+        return gain * self.pneumatics.pressure_limit / self.length
+
+    @property
     def static_gain(self) -> NDArray[np.float64]:
         """(M,) `Segment.static_gain` [rad/Pa]."""
         return np.array([segment.static_gain for segment in self.segments])

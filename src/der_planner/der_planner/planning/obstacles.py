@@ -44,7 +44,7 @@ _SMOOTHED = 4.0
 """Standard deviation, in poses, by which the way past is smoothed: it would begin with a kink."""
 _NEARNESS = 1e-3
 """Tip error that a unit change of a bend angle is worth there [m/rad]."""
-_FAR = 10.0
+_OTHER_UNIT = 10.0
 """Distance from the clamp, over the limb's length, and force, over what the limb's tip presses with
 at most, beyond which a number has another unit."""
 
@@ -202,15 +202,14 @@ class Obstacles:
         Raises:
             PlanningError: names what cannot be, and the remedy.
         """
-        limb, length = model.limb, model.limb.length
-        moment = max(each.moment_gain for each in limb.segments) * limb.pneumatics.pressure_limit
+        length, force = model.limb.length, model.limb.tip_force
         for each in self.items:
-            if each.allowed_force > _FAR * moment / length:
+            if each.allowed_force > _OTHER_UNIT * force:
                 raise PlanningError(
                     f"{each} may be touched with {each.allowed_force:g} N, and the tip presses "
-                    f"with some {moment / length:.2g} N at most: give N"
+                    f"with some {force:.2g} N at most: give N"
                 )
-            if abs(each.away(np.zeros(2))[0]) > _FAR * length:
+            if abs(each.away(np.zeros(2))[0]) > _OTHER_UNIT * length:
                 raise PlanningError(
                     f"{each} in the file of obstacles is far too large for a limb of {length:.3g} "
                     "m: give all lengths in metres"
