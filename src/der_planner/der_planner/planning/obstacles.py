@@ -23,8 +23,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import gaussian_filter1d
-from scipy.optimize import NonlinearConstraint, minimize
+import piqp
+from scipy import sparse
 
 from der_planner.arrays import Array
 from der_planner.files import read_yaml
@@ -39,11 +39,17 @@ _FINE = 4
 _LARGE = 1e4
 """Radius of a circle whose edge is straight beside a limb [m]."""
 _MARGIN = 1.5e-3
-"""Distance that poses which are led past keep beside what is allowed [m]."""
-_SMOOTHED = 4.0
-"""Standard deviation, in poses, by which the way past is smoothed: it would begin with a kink."""
+"""Distance that poses keep beside what is allowed [m]."""
+_BESIDE = 3e-2
+"""Points this far from where they may be are kept from coming nearer than that [m]."""
 _NEARNESS = 1e-3
-"""Tip error that a unit change of a bend angle is worth there [m/rad]."""
+"""Tip error that a change of a bend angle is worth [m/rad]."""
+_SMOOTH = 1.0
+"""Tip error that a second difference of this change from pose to pose is worth [m/rad]."""
+_PART = 30.0
+"""Tip error that a distance which is lacking is worth."""
+_STEP = 0.1
+"""Largest change of a bend angle at a time [rad]."""
 _OTHER_UNIT = 10.0
 """Distance from the clamp, over the limb's length, and force, over what the limb's tip presses with
 at most, beyond which a number has another unit."""
@@ -177,9 +183,7 @@ class Obstacles:
             obstacle: of these.
             curves: (K, P, 2) centrelines from the clamp on [m].
         """
-        share = np.arange(_FINE) / _FINE
-        pieces = curves[:, :-1, None] + share[:, None] * np.diff(curves, axis=1)[:, :, None]
-        points = np.concatenate([pieces.reshape(len(curves), -1, 2), curves[:, -1:]], axis=1)
+        points = _fine(curves)
         distance, out = obstacle.away(points)
         clearance = distance.min(axis=1) - self.limb_radius
         closest = distance.argmin(axis=1)
@@ -252,61 +256,96 @@ class Obstacles:
             return ""
         return f"the limb touches {', '.join(touched)}; the tip is predicted as if nothing held it"
 
-    def led_past(self, model: RodModel, curves: Array, bend_angles: Array) -> Array:
-        """Return by how much the tip is led aside (K, 2) [m] to keep off what is in the way.
+    def led_past(
+        self,
+        model: RodModel,
+        curves: Array,
+        bend_angles: Array,
+        off: tuple[Array, Array],
+        room: tuple[Array, Array],
+    ) -> Array:
+        """Return a change (K, M) of a motion's bend angles [rad] that leads it past its obstacles.
 
-        A pose that would touch with more force than is allowed is moved: its bend angles minimise
-        the tip's distance, with every obstacle as far away as it must be.
+        It is zero where every pose has its distance. Else all poses are changed together, smoothly:
+        the tip stays as near to its path as it can, and no point of the limb goes nearer to an
+        obstacle than it may. Places are taken for linear in the change. So it is small, and sought
+        again about what it has led to.
 
         Args:
             model: rod of the limb.
             curves: (K, P, 2) centrelines of the poses [m].
             bend_angles: (K, M) of them [rad].
+            off: (K, 2) of the tip from its path [m], and (K, 2, M) its derivative [m/rad].
+            room: (K, M) least and largest change [rad].
         """
-        moved, change = np.zeros((len(curves), 2)), np.zeros(bend_angles.shape[1])
-        for k, (curve, bend) in enumerate(zip(curves, bend_angles, strict=True)):
-            near = [self.nearest(each, curve[None]) for each in self.items]
-            if all(found.clearance >= 0.0 for found in near):
-                change = np.zeros_like(change)
-                continue
-            least = np.array(
-                [
-                    _MARGIN - each.allowed_force * _slack(model, bend, found)
-                    for each, found in zip(self.items, near, strict=True)
-                ]
-            )
-            change = self._aside(model, curve, bend, least, change)
-            moved[k] = model.kinematics.tip(bend + change) - model.kinematics.tip(bend)
-        smooth: Array = gaussian_filter1d(moved, _SMOOTHED, axis=0, mode="nearest")
-        return smooth
+        points, moved = _fine(curves), model.kinematics.tangents(bend_angles)
+        clamp = ((0, 0), (0, 0), (curves.shape[1] - moved.shape[2], 0), (0, 0))
+        moved = _fine(np.pad(moved, clamp))
+        found = []
+        for obstacle in self.items:
+            nearest, (distance, out) = self.nearest(obstacle, curves), obstacle.away(points)
+            least = -obstacle.allowed_force * _slack(model, bend_angles[nearest.index], nearest)
+            lacking = least + _MARGIN - (distance - self.limb_radius)
+            near = np.nonzero(lacking > -_BESIDE)
+            away = np.einsum("rmc,rc->rm", moved[near[0], :, near[1]], out[near])
+            found.append((near[0], away, lacking[near]))
+        pose, away, wanted = (np.concatenate(column) for column in zip(*found, strict=True))
+        if np.all(wanted <= 0.0) and not off[0].any():
+            return np.zeros_like(bend_angles)
+        return _smallest(pose, away, wanted, off, room)
 
-    def _aside(
-        self, model: RodModel, curve: Array, bend: Array, least: Array, guess: Array
-    ) -> Array:
-        """Return the change (M,) of a pose's bend angles [rad] that leads it past.
 
-        Args:
-            model: rod of the limb.
-            curve: (P, 2) centreline of the pose [m].
-            bend: (M,) of it [rad].
-            least: of the clearances of the obstacles [m].
-            guess: the search begins there.
-        """
-        even = model.kinematics
-        start, tip = even.curve(bend), even.tip(bend)
+def _fine(curves: Array) -> Array:
+    """Return points (…, Q, 2) along polylines (…, P, 2)."""
+    share = np.arange(_FINE)[:, None] / _FINE
+    pieces = curves[..., :-1, None, :] + share * np.diff(curves, axis=-2)[..., None, :]
+    within = pieces.reshape(*curves.shape[:-2], -1, 2)
+    return np.concatenate([within, curves[..., -1:, :]], axis=-2)
 
-        def clearances(change: Array) -> Array:
-            moved = curve + even.curve(bend + change) - start
-            return np.array([self.nearest(each, moved[None]).clearance for each in self.items])
 
-        def cost(change: Array) -> float:
-            left = even.tip(bend + change) - tip
-            return 1e4 * float(left @ left + _NEARNESS**2 * change @ change)
+def _smallest(
+    pose: Array, away: Array, wanted: Array, off: tuple[Array, Array], room: tuple[Array, Array]
+) -> Array:
+    """Return the change (K, M) of bend angles [rad] that brings points away from obstacles.
 
-        # In centimetres, as the solver's tolerances mean it.
-        keep_off = NonlinearConstraint(lambda c: 100 * clearances(c), 100 * least, np.inf)
-        found = minimize(cost, guess, method="SLSQP", constraints=keep_off)
-        return np.asarray(found.x, dtype=float)
+    It minimises Σ |off + J δ|² + ν² |δ|² + λ² |D² δ|² + w² e² with away · δ + e ≥ wanted, D² the
+    second difference, and an e ≥ 0 of each pose: what cannot be done in one step is done in part.
+
+    Args:
+        pose: (R,) of each point.
+        away: (R, M) by which a point moves away [m/rad].
+        wanted: (R,) by how much it should [m].
+        off: see `Obstacles.led_past`.
+        room: see there.
+    """
+    missed, slopes = off
+    count, inputs = missed.shape[0], away.shape[1]
+    near = sparse.bsr_array((slopes, np.arange(count), np.arange(count + 1)))
+    second = sparse.diags_array([1.0, -2.0, 1.0], offsets=[0, -1, -2], shape=(count + 2, count))
+    smooth = _SMOOTH * sparse.kron(second, sparse.eye_array(inputs))
+    pull = near.T @ near + smooth.T @ smooth + _NEARNESS**2 * sparse.eye_array(count * inputs)
+    square = sparse.block_diag([pull, _PART**2 * sparse.eye_array(count)], format="csc")
+    places = inputs * pose[:, None] + np.arange(inputs)
+    columns = np.column_stack([places, count * inputs + pose])
+    factors = np.column_stack([away, np.ones(len(pose))])
+    ends = np.arange(len(pose) + 1) * (inputs + 1)
+    rows = sparse.csr_array((factors.ravel(), columns.ravel(), ends), (len(pose), square.shape[0]))
+    solver, none = piqp.SparseSolver(), np.zeros(count)
+    solver.setup(
+        sparse.csc_matrix(square),
+        np.append(near.T @ missed.ravel(), none),
+        None,
+        None,
+        sparse.csc_matrix(rows),
+        wanted,
+        None,
+        np.append(np.maximum(room[0], -_STEP), none),
+        np.append(np.minimum(room[1], _STEP), none + 1.0),
+    )
+    if solver.solve() != piqp.PIQP_SOLVED:
+        return np.zeros((count, inputs))  # the motion is refused
+    change: Array = np.asarray(solver.result.x)[: count * inputs].reshape(count, inputs)
+    return change
 
 
 def _slack(model: RodModel, bend: Array, found: Nearest) -> float:

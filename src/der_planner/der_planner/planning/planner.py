@@ -25,15 +25,19 @@ from der_planner.planning.motions import NAMES, Motion, Reference
 from der_planner.planning.obstacles import Obstacles
 from der_planner.planning.optimal import Optimiser, Optimum
 from der_planner.planning.plan_file import Plan
-from der_planner.planning.timing import Start
+from der_planner.planning.timing import Start, resting_spline
 from der_planner.planning.workspace import UnreachableError, Workspace
 from der_planner.rod import ConvergenceError
 
 _THREADS = ThreadpoolController()
 _FINE = 2
 """Points of the balance's grid a control period."""
-_ROUNDS = 6
+_ROUNDS = 8
 """A reference is led past what is in the way so often at most."""
+_ROOM = 0.5
+"""Share of the pressure that is left which one of these rounds may use."""
+_SAME = 3e-3
+"""Change of a bend angle up to which the way past stays the same [rad]."""
 _SEARCHES = 4
 """A nearest path is sought so often, each time with less pressure."""
 _HELD = 0.94
@@ -104,7 +108,7 @@ def plan(
         body = rod if model == "der" else Model.of(limb, model)
         reference, configuration = reference_and_configuration(motion, rod, body, start)
         led = ""
-        if obstacles is not None:
+        if obstacles is not None and obstacles.items:
             rounds = _ROUNDS if model == "der" and method == "optimal" else 0
             configuration, led, reference = _led_past(
                 obstacles, rod, configuration, reference, rounds
@@ -207,12 +211,21 @@ def _led_past(
     """
     path, led, time = reference.tip, "", reference.time
     obstacles.check_rest(rod, configuration.curves(time[:1])[0], configuration.bend_at(time[:1])[0])
-    for more in range(rounds, -1, -1):
-        curves, bend = configuration.curves(time), configuration.bend_at(time)
-        aside = obstacles.led_past(rod, curves, bend) if more else np.zeros_like(path)
-        if not aside.any():
+    begin = configuration.near(time).tip(configuration.bend_at(time))
+    for _ in range(rounds):
+        bend, shape = configuration.bend_at(time), configuration.near(time)
+        off = shape.tip(bend) - begin, shape.tip_jacobians(bend)
+        room = _room(configuration, time)
+        change = obstacles.led_past(rod, configuration.curves(time), bend, off, room)
+        if np.abs(change).max() < _SAME:
             break
-        reference = replace(reference, tip=reference.tip + aside)
+        angles = reference.bend_angles + change
+        reference = replace(
+            reference,
+            tip=path + shape.tip(bend + change) - begin,
+            bend_angles=angles,
+            spline=resting_spline(time, angles, reference.start),
+        )
         try:
             configuration = configure(configuration.model, reference)
         except PlanningError as error:
@@ -225,8 +238,19 @@ def _led_past(
             f"what is in the way leads the tip up to {off.max() * 1000:.1f} mm off its path, at "
             f"{time[off.argmax()]:.1f} s; errors count from the path past it"
         )
+    curves, bend = configuration.curves(time), configuration.bend_at(time)
     touched = obstacles.check(rod, time, curves, bend)
     return configuration, "; ".join(filter(None, [led, touched])), reference
+
+
+def _room(configuration: Configuration, time: Array) -> tuple[Array, Array]:
+    """Return by how much bend angles (K, M) [rad] may surely change under the pressure limit."""
+    material, limb = configuration.model.material, configuration.model.limb
+    effective, bend = configuration.pressures("projected", time), configuration.bend_at(time)
+    pressure = material.differential_pressure(time, effective, bend)
+    limit, gain = limb.pneumatics.pressure_limit, _ROOM * limb.static_gain
+    low, high = gain * (-limit - pressure), gain * (limit - pressure)
+    return np.minimum(low, 0.0), np.maximum(high, 0.0)
 
 
 def choose_method(model: str, method: str) -> str:
