@@ -237,7 +237,7 @@ def test_the_optimal_plan_leads_the_limb_past_what_it_cannot_touch(
     left_by = np.linalg.norm(found.tip_reference - reference.tip, axis=1)
     assert 0.0 < left_by.max() < most
     clearance = np.array([way.nearest(way.items[0], pose[None]).clearance for pose in poses])
-    assert left_by[clearance > 0.02].max() < 2e-3
+    assert left_by[clearance > 0.02].max() < 3e-3
     assert "leads the tip" in " ".join(found.warnings)
     assert np.linalg.norm(found.tip_predicted - found.tip_reference, axis=1).mean() < 5e-4
 

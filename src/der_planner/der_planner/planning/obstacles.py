@@ -28,9 +28,10 @@ from scipy import sparse
 
 from der_planner.arrays import Array
 from der_planner.files import read_yaml
-from der_planner.model import RodModel
+from der_planner.model import CONTROL_PERIOD, RodModel
 from der_planner.model.compliance import compliance
 from der_planner.planning.loads import PlanningError, place_of
+from der_planner.planning.timing import SLEW_SHARE
 
 _CIRCLE = {"circle_m", "radius_m", "allowed_force_n"}
 _HALF_PLANE = {"half_plane_m", "normal", "allowed_force_n"}
@@ -38,7 +39,7 @@ _FINE = 4
 """Points a piece of the centreline between two nodes."""
 _LARGE = 1e4
 """Radius of a circle whose edge is straight beside a limb [m]."""
-_MARGIN = 1.5e-3
+_MARGIN = 3e-3
 """Distance that poses keep beside what is allowed [m]."""
 _BESIDE = 3e-2
 """Points this far from where they may be are kept from coming nearer than that [m]."""
@@ -285,14 +286,19 @@ class Obstacles:
         for obstacle in self.items:
             nearest, (distance, out) = self.nearest(obstacle, curves), obstacle.away(points)
             least = -obstacle.allowed_force * _slack(model, bend_angles[nearest.index], nearest)
-            lacking = least + _MARGIN - (distance - self.limb_radius)
+            clearance = distance - self.limb_radius
+            # No pose is led farther away than the limb begins.
+            lacking = least + min(_MARGIN, clearance[0].min()) - clearance
             near = np.nonzero(lacking > -_BESIDE)
             away = np.einsum("rmc,rc->rm", moved[near[0], :, near[1]], out[near])
             found.append((near[0], away, lacking[near]))
         pose, away, wanted = (np.concatenate(column) for column in zip(*found, strict=True))
         if np.all(wanted <= 0.0) and not off[0].any():
             return np.zeros_like(bend_angles)
-        return _smallest(pose, away, wanted, off, room)
+        own, air = np.diff(bend_angles, axis=0), model.limb.pneumatics
+        rate = SLEW_SHARE * air.slew_limit * CONTROL_PERIOD * model.limb.static_gain
+        turns = np.minimum(-rate - own, 0.0), np.maximum(rate - own, 0.0)
+        return _smallest(pose, away, wanted, off, (room, turns))
 
 
 def _fine(curves: Array) -> Array:
@@ -304,7 +310,11 @@ def _fine(curves: Array) -> Array:
 
 
 def _smallest(
-    pose: Array, away: Array, wanted: Array, off: tuple[Array, Array], room: tuple[Array, Array]
+    pose: Array,
+    away: Array,
+    wanted: Array,
+    off: tuple[Array, Array],
+    within: tuple[tuple[Array, Array], tuple[Array, Array]],
 ) -> Array:
     """Return the change (K, M) of bend angles [rad] that brings points away from obstacles.
 
@@ -316,9 +326,9 @@ def _smallest(
         away: (R, M) by which a point moves away [m/rad].
         wanted: (R,) by how much it should [m].
         off: see `Obstacles.led_past`.
-        room: see there.
+        within: least and largest change (K, M) and steps of it from pose to pose (K − 1, M) [rad].
     """
-    missed, slopes = off
+    (missed, slopes), (room, turns) = off, within
     count, inputs = missed.shape[0], away.shape[1]
     near = sparse.bsr_array((slopes, np.arange(count), np.arange(count + 1)))
     second = sparse.diags_array([1.0, -2.0, 1.0], offsets=[0, -1, -2], shape=(count + 2, count))
@@ -330,15 +340,18 @@ def _smallest(
     factors = np.column_stack([away, np.ones(len(pose))])
     ends = np.arange(len(pose) + 1) * (inputs + 1)
     rows = sparse.csr_array((factors.ravel(), columns.ravel(), ends), (len(pose), square.shape[0]))
+    first = sparse.diags_array([-1.0, 1.0], offsets=[0, 1], shape=(count - 1, count))
+    steps = sparse.kron(first, sparse.eye_array(inputs))
+    apart = sparse.csr_array((steps.shape[0], count))
     solver, none = piqp.SparseSolver(), np.zeros(count)
     solver.setup(
         sparse.csc_matrix(square),
         np.append(near.T @ missed.ravel(), none),
         None,
         None,
-        sparse.csc_matrix(rows),
-        wanted,
-        None,
+        sparse.csc_matrix(sparse.vstack([rows, sparse.hstack([steps, apart])])),
+        np.append(wanted, turns[0]),
+        np.append(np.full(len(wanted), np.inf), turns[1]),
         np.append(np.maximum(room[0], -_STEP), none),
         np.append(np.minimum(room[1], _STEP), none + 1.0),
     )

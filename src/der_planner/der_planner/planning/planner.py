@@ -43,7 +43,7 @@ _SEARCHES = 4
 _HELD = 0.94
 """Share of the pressure that may be held, where a refusal does not tell it."""
 _SHRINK = 0.98
-"""Share of what may be held that the next search has."""
+"""Share of what may be held that the next search has, or a way past what is in the way."""
 _NOTABLE_CUT = 8e-4
 """Cuts by limits are worth a warning from this share of the pressure limit on."""
 _NOTABLE_OPPOSITE = 0.042
@@ -120,6 +120,10 @@ def plan(
             start_method = "projected" if method == "optimal" else method
             wanted, slow = balance(configuration, reference, start_method)
             found = _solve(configuration, reference, method, wanted, report)
+            touched = ""
+            if obstacles is not None:
+                moving = configuration.response(found.commands, configuration.bend_at).bend_angles
+                touched = _touched(obstacles, rod, configuration, reference.time, moving[:-1])
         except ConvergenceError as error:
             raise PlanningError(
                 f"the rod cannot be rolled forward along this motion ({error}): take a longer "
@@ -131,6 +135,7 @@ def plan(
         seen.other_mounting,
         nearly_buckling(seen),
         led,
+        touched,
         *_limit_warnings(configuration, reference, wanted, slow, found, method),
         _error_warning(found.tip, reference, method),
         _calibration_warning(seen, bend),
@@ -203,10 +208,7 @@ def _led_past(
 ) -> tuple[Configuration, str, Reference]:
     """Lead a reference past what is in the way; return its configuration, a warning, and itself.
 
-    A limb that sags does not move as an evenly bent one: what is left is led past again.
-
     Raises:
-        ObstacleError: the limb would run into an obstacle all the same.
         PlanningError: an obstacle is where the limb rests, or leaves no way past that it can take.
     """
     path, led, time = reference.tip, "", reference.time
@@ -238,9 +240,25 @@ def _led_past(
             f"what is in the way leads the tip up to {off.max() * 1000:.1f} mm off its path, at "
             f"{time[off.argmax()]:.1f} s; errors count from the path past it"
         )
-    curves, bend = configuration.curves(time), configuration.bend_at(time)
-    touched = obstacles.check(rod, time, curves, bend)
-    return configuration, "; ".join(filter(None, [led, touched])), reference
+    return configuration, led, reference
+
+
+def _touched(
+    obstacles: Obstacles, rod: RodModel, configuration: Configuration, time: Array, bend: Array
+) -> str:
+    """Refuse a motion whose own prediction, bend angles (K, M) [rad], runs into an obstacle.
+
+    Returns what it touches with a force that is allowed, see `Obstacles.check`.
+
+    Raises:
+        ObstacleError: names instant, place, clearance and force.
+    """
+    shape, pairs = (
+        configuration.model.kinematics,
+        zip(bend, configuration.bend_at(time), strict=True),
+    )
+    moved = np.stack([shape.curve(moving) - shape.curve(pose) for moving, pose in pairs])
+    return obstacles.check(rod, time, configuration.curves(time) + moved, bend)
 
 
 def _room(configuration: Configuration, time: Array) -> tuple[Array, Array]:
@@ -248,8 +266,9 @@ def _room(configuration: Configuration, time: Array) -> tuple[Array, Array]:
     material, limb = configuration.model.material, configuration.model.limb
     effective, bend = configuration.pressures("projected", time), configuration.bend_at(time)
     pressure = material.differential_pressure(time, effective, bend)
-    limit, gain = limb.pneumatics.pressure_limit, _ROOM * limb.static_gain
+    limit, gain = _SHRINK * limb.pneumatics.pressure_limit, _ROOM * limb.static_gain
     low, high = gain * (-limit - pressure), gain * (limit - pressure)
+    low[[0, -1]] = high[[0, -1]] = 0.0  # it begins and ends as before
     return np.minimum(low, 0.0), np.maximum(high, 0.0)
 
 
