@@ -343,17 +343,17 @@ def _smallest(
     first = sparse.diags_array([-1.0, 1.0], offsets=[0, 1], shape=(count - 1, count))
     steps = sparse.kron(first, sparse.eye_array(inputs))
     apart = sparse.csr_array((steps.shape[0], count))
-    solver, none = piqp.SparseSolver(), np.zeros(count)
+    solver, zeros = piqp.SparseSolver(), np.zeros(count)
     solver.setup(
         sparse.csc_matrix(square),
-        np.append(near.T @ missed.ravel(), none),
+        np.append(near.T @ missed.ravel(), zeros),
         None,
         None,
         sparse.csc_matrix(sparse.vstack([rows, sparse.hstack([steps, apart])])),
         np.append(wanted, turns[0]),
         np.append(np.full(len(wanted), np.inf), turns[1]),
-        np.append(np.maximum(room[0], -_STEP), none),
-        np.append(np.minimum(room[1], _STEP), none + 1.0),
+        np.append(np.maximum(room[0], -_STEP), zeros),
+        np.append(np.minimum(room[1], _STEP), np.full(count, np.inf)),
     )
     if solver.solve() != piqp.PIQP_SOLVED:
         return np.zeros((count, inputs))  # the motion is refused

@@ -107,7 +107,7 @@ def plan(
         rod = RodModel(limb, nodes)
         body = rod if model == "der" else Model.of(limb, model)
         reference, configuration = reference_and_configuration(motion, rod, body, start)
-        led = ""
+        led = touched = ""
         if obstacles is not None and obstacles.items:
             rounds = _ROUNDS if model == "der" and method == "optimal" else 0
             configuration, led, reference = _led_past(
@@ -120,7 +120,6 @@ def plan(
             start_method = "projected" if method == "optimal" else method
             wanted, slow = balance(configuration, reference, start_method)
             found = _solve(configuration, reference, method, wanted, report)
-            touched = ""
             if obstacles is not None:
                 moving = configuration.response(found.commands, configuration.bend_at).bend_angles
                 touched = _touched(obstacles, rod, configuration, reference.time, moving[:-1])
@@ -253,12 +252,9 @@ def _touched(
     Raises:
         ObstacleError: names instant, place, clearance and force.
     """
-    shape, pairs = (
-        configuration.model.kinematics,
-        zip(bend, configuration.bend_at(time), strict=True),
-    )
-    moved = np.stack([shape.curve(moving) - shape.curve(pose) for moving, pose in pairs])
-    return obstacles.check(rod, time, configuration.curves(time) + moved, bend)
+    shape, poses = configuration.model.kinematics, configuration.bend_at(time)
+    moved = [shape.curve(to) - shape.curve(pose) for to, pose in zip(bend, poses, strict=True)]
+    return obstacles.check(rod, time, configuration.curves(time) + np.stack(moved), bend)
 
 
 def _room(configuration: Configuration, time: Array) -> tuple[Array, Array]:
