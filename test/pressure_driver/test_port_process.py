@@ -243,7 +243,7 @@ def test_a_switch_that_is_neither_true_nor_false_is_refused(monkeypatch, capsys)
 # ------------------------------------------------------------- one of the two processes ends
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP, signal.SIGTERM])
 def test_the_node_vents_for_a_process_of_the_port_that_dies_or_hangs(make_rigs, number):
     rigs = make_rigs(*(NAMES if number == signal.SIGKILL else ("ezloop",)))
     for rig in rigs:
@@ -252,7 +252,8 @@ def test_the_node_vents_for_a_process_of_the_port_that_dies_or_hangs(make_rigs, 
         os.kill(rig.driver.process_id, number)
     for rig in rigs:
         wait_for(lambda rig=rig: rig.driver.error, "the node to notice")
-        assert re.search("(has ended|no sign of life).* was sent", rig.driver.error)
+        told = "(has ended|no sign of life).* was sent|ended by somebody else: .* vented"
+        assert re.search(told, rig.driver.error)
         rig.wait_vented()
         assert not rig.driver.ask("arm")[0]
         wait_for(lambda rig=rig: not rig.port.host_present, "a port that nobody holds")
@@ -274,8 +275,8 @@ def test_a_node_that_hangs_has_the_limb_let_down_and_may_go_on_and_one_that_ends
             rig.listen()
             if Mode.VENTING in rig.modes and rig.mode == Mode.ARMED:
                 waiting.remove(rig)
-        assert time.time_ns() < start + 178 * PERIOD, "played to the end"
     for rig in rigs:
+        assert rig.state["setpoints_executed"] < 180, "played to the end"
         assert rig.modes[-4:] == [Mode.TRACKING, Mode.HOLDING, Mode.VENTING, Mode.ARMED]
         wait_for(lambda rig=rig: rig.offer((3000.0, -2000.0)) or rig.pressurised(), "pressure")
         rig.channel.socket.close()

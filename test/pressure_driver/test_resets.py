@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pressure_driver.core import BoardWatch
 from pressure_driver.emulator import BoardReading
 from pressure_driver.emulator.firmware import BOARDS
 from pressure_driver.protocols import BoardReset, host_protocol
@@ -74,6 +75,15 @@ def test_echoes_that_stop_are_a_fault_within_two_seconds(simulate, protocol):
     assert "not answered" in " ".join(sim.core.obstacles())
     sim.have()
     sim.arm()
+
+
+@pytest.mark.parametrize("rate", [20.0, 100.0])
+def test_a_board_that_never_echoes_is_noticed_at_any_rate(rate):
+    settings = Settings(protocol="native", rate=rate)
+    watch = BoardWatch(host_protocol(settings), settings)
+    for number in range(int(2.0 * rate)):
+        watch.has_sent(number, number / rate)
+    assert "not answered a command" in " ".join(each.text for each in watch.conditions(2.0))
 
 
 def test_one_damaged_report_of_a_ctrlp_board_is_no_reset():

@@ -302,7 +302,10 @@ def test_over_pressure_is_seen_where_it_is_beyond_what_a_usual_limb_may_read():
     assert "over-pressure in chamber 0" in next(monitor.conditions(0.05)).text
 
 
-def test_a_board_that_cannot_be_told_the_limit_is_not_armed(simulate):
-    sim = simulate("ezloop", pressure_limit=250_000.0)
+@pytest.mark.parametrize(
+    ("protocol", "reach"), [("ezloop", 125_000), ("ctrlp", 500_000), ("festo", 700_000)]
+)
+def test_a_board_that_cannot_be_told_the_limit_is_not_armed(simulate, protocol, reach):
+    sim = simulate(protocol, pressure_limit=1.2 * reach)
     sim.run(3.0)
-    assert "reaches 125000 Pa" in sim.core.arm()[1]
+    assert f"reaches {reach} Pa" in sim.core.arm()[1]

@@ -259,7 +259,7 @@ class BoardProcess:
             lines.flush(self._line.fileno())
 
     def _read(self) -> None:
-        """Take the bytes that are there; none means that the device has gone."""
+        """Take the bytes that are there."""
         assert self._line is not None
         assert self._bytes_waiting is not None
         self._bytes_waiting.poll(0)

@@ -55,7 +55,7 @@ class BoardWatch:
         """[s] from the last command that was echoed to its echo."""
         self._protocol = protocol
         self._settings = settings
-        self._unanswered: deque[tuple[int | None, float]] = deque(maxlen=64)
+        self._unanswered: deque[tuple[int | None, float]] = deque(maxlen=256)
         self._greeted_at = 0.0
 
     def opened(self, now: float) -> None:

@@ -24,7 +24,8 @@ from pressure_driver.protocols.ezloop import PASCAL_PER_HECTOPASCAL
 from pressure_driver.safety import Mode
 from pressure_driver.settings import Declared, Settings, declarations
 
-CMD_U_T = "cmd_u_t"
+MOST_PRESSURES, LONGEST_NAME = 100, 200
+"""Of a message; longer ones would not fit through the channel to the port's process."""
 LIFE_PERIOD = 0.1
 """[s] between two signs of life to the port's process."""
 CALLS = QoSProfile(depth=1000)
@@ -89,12 +90,14 @@ class PressureDriver(Node):
         )
         self.create_subscription(OperatorLease, topics.OPERATOR_LEASE, self._on_lease, qos.LEASES)
         if settings.accept_cmd_u_t:
-            self.create_subscription(Float64MultiArray, CMD_U_T, self._on_cmd_u_t, qos.SETPOINTS)
+            self.create_subscription(
+                Float64MultiArray, topics.CMD_U_T, self._on_cmd_u_t, qos.SETPOINTS
+            )
         DiagnosticsPublisher(self, self._report, settings.port, clock_of_all=True)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(LIFE_PERIOD, self._show_life, clock=steady)
         self.get_logger().info(
-            f"{settings.protocol} board on {settings.port}: vented, waiting for `arm`"
+            f"{settings.protocol} board on {settings.port}: commanded to vent, waiting for `arm`"
         )
 
     # ------------------------------------------------------------------------------ inputs
@@ -102,8 +105,8 @@ class PressureDriver(Node):
     def _on_setpoint(self, message: PressureSetpoint, info: dict[str, int]) -> None:
         setpoint = (
             nanoseconds(message.header.stamp),
-            list(message.differential_pressure),
-            message.plan_id,
+            list(message.differential_pressure[:MOST_PRESSURES]),
+            message.plan_id[:LONGEST_NAME],
             message.index,
             message.revision,
         )
@@ -111,11 +114,11 @@ class PressureDriver(Node):
 
     def _on_cmd_u_t(self, message: Float64MultiArray, info: dict[str, int]) -> None:
         """Untimed differences in hPa, as labs publish them from MATLAB."""
-        differential = [value * PASCAL_PER_HECTOPASCAL for value in message.data]
-        self._offer((0, differential, "", 0, 0), CMD_U_T, info)
+        differential = [value * PASCAL_PER_HECTOPASCAL for value in message.data[:MOST_PRESSURES]]
+        self._offer((0, differential, "", 0, 0), topics.CMD_U_T, info)
 
     def _on_lease(self, message: OperatorLease) -> None:
-        self._port.send("lease", message.source, message.period)
+        self._port.send("lease", message.source[:LONGEST_NAME], message.period)
 
     def _offer(self, setpoint: tuple[object, ...], topic: str, info: dict[str, int]) -> None:
         alone = self.count_publishers(topic) <= 1

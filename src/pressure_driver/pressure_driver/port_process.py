@@ -131,7 +131,7 @@ class PortProcess:
         self.log: deque[tuple[str, bool]] = deque(maxlen=200)
         """Sentences for the log, and whether they are warnings, until they are taken."""
         self.error = ""
-        """Why the process had to be replaced, and whether the board was vented; empty before."""
+        """Why the process is gone, and whether the board was vented; empty before."""
         self._settings = replace(settings, port=stable_name(settings.port))
         self._on_message = on_message
         self._answers: queue.Queue[tuple[bool, str]] = queue.Queue()
@@ -139,6 +139,7 @@ class PortProcess:
         """What the board understands."""
         self._descriptor = -1
         self._outcome: str | None = None
+        self._ending = False
         self._thread = threading.Thread(target=self._listen, name="port process", daemon=True)
 
     def start(self) -> None:
@@ -189,10 +190,11 @@ class PortProcess:
         self.send(word)
         with contextlib.suppress(queue.Empty):
             return self._answers.get(timeout=0.0 if self.error else ANSWER_TIME)
-        return False, self.error or "the process of the port does not answer: it is replaced"
+        return False, self.error or "the process of the port does not answer"
 
     def close(self) -> str:
         """End the process in order; return what is left to be done about the limb, or nothing."""
+        self._ending = True
         self.send("end")
         self._thread.join(END_TIME)
         if self._thread.is_alive():
@@ -231,6 +233,9 @@ class PortProcess:
                 problem = lines.vent_line(self._descriptor, command, lines.VENT_TIME)
             told = f"the vent command was sent for {lines.VENT_TIME:g} s; see that it has vented"
             self.error = f"{reason}: {problem or told}"
+        elif not self._ending:
+            left = self._outcome or "the board is vented"
+            self.error = f"the process of the port was ended by somebody else: {left}"
         lines.release_descriptor(self._descriptor)
         self._on_message()
 

@@ -245,12 +245,13 @@ class PublisherGate:
     def refuse(self, origin: Origin) -> str:
         """Return why a setpoint from there is not taken, or nothing if it is."""
         owner = self._owner or origin._replace(number=origin.number - 1)
-        counted = origin.number - owner.number if origin.topic == owner.topic else -1
+        ahead = origin.number - owner.number if origin.topic == owner.topic else -1
+        repeats, is_next, skips = ahead == 0, ahead == 1, ahead > 1
         before = (origin.topic, origin.number - 1)
         # A number that two publishers have reached does not tell any more which of them goes on.
-        if counted == 0 or (counted == 1 and before in self._others):
+        if repeats or (is_next and before in self._others):
             self._in_step = True
-        if not self._in_step and (counted == 1 or (counted > 1 and origin.alone)):
+        if not self._in_step and (is_next or (skips and origin.alone)):
             self._owner = origin
             return ""
         self.refused += 1
@@ -330,11 +331,14 @@ class TickGrid:
     def take(self, wall: int) -> int | None:
         """Return the instant [ns] of the tick that is due at a wall time, or None if none is."""
         due = wall // self.period * self.period
-        last, self._last = self._last, due
-        if last is None or last - self.period <= due <= last:
-            self._last = due if last is None else last
+        if self._last is None:
+            self._last = due
             return None
-        self.missed += max(due - last, self.period) // self.period - 1
+        steps = (due - self._last) // self.period
+        if steps in (-1, 0):  # not due yet, or a clock that was slewed back by a little
+            return None
+        self._last = due
+        self.missed += max(steps - 1, 0)
         return due
 
 

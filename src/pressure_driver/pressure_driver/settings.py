@@ -1,9 +1,7 @@
 """The parameters of the driver and of the emulated board, each declared once.
 
 From here come what the nodes declare, the options of the `board` command, the limits of the state
-machine, the files under `config/` and the table in the README. After a change, write the last two:
-
-    python3 scripts/write_driver_parameters.py
+machine and the files under `config/`: after a change, `python3 scripts/write_driver_parameters.py`.
 """
 
 from __future__ import annotations

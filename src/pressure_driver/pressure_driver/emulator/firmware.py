@@ -13,7 +13,7 @@ from pressure_driver.protocols import cut_at, cut_lines
 from pressure_driver.protocols.ctrlp import PASCAL_PER_KILOPASCAL
 from pressure_driver.protocols.ezloop import LARGEST_WIRE_VALUE, PASCAL_PER_HECTOPASCAL, numbers_of
 from pressure_driver.protocols.native import (
-    HELLO_BODY,
+    IDENTITY_HEAD,
     LONGEST_VALIDITY,
     SETPOINT_HEAD,
     STATUS_HEAD,
@@ -186,7 +186,7 @@ class NativeBoard(BoardProtocol):
     def reply(self, command: BoardCommand, reading: BoardReading) -> bytes:
         """IDENTITY to HELLO, FAULT to what was refused, STATUS to everything else."""
         if command.kind == "hello":
-            body = HELLO_BODY.pack(
+            body = IDENTITY_HEAD.pack(
                 self.chamber_count, 0, self._largest, round(reading.atmosphere), len(self._FIRMWARE)
             )
             return encode(FrameType.IDENTITY, self._next(), body + self._FIRMWARE)

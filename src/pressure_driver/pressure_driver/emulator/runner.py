@@ -105,11 +105,11 @@ class BoardRunner:
                 air_time = now
                 if now >= next_air:
                     self._on_air(now, pressure)
-                    next_air = _following(next_air, now, AIR_PERIOD)
+                    next_air = now + AIR_PERIOD - (now - next_air) % AIR_PERIOD
             if now >= next_telemetry:
                 delay = round(self.board.faults.delay * NANOSECONDS)
                 self._delayed.append((now + delay, self.board.telemetry()))
-                next_telemetry = _following(next_telemetry, now, TELEMETRY_PERIOD)
+                next_telemetry = now + TELEMETRY_PERIOD - (now - next_telemetry) % TELEMETRY_PERIOD
             while self._delayed and self._delayed[0][0] <= now:
                 self.port.send(self._delayed.popleft()[1])
 
@@ -132,8 +132,3 @@ class BoardRunner:
         else:
             self.port.unplug()
             self._replug_at = now + faults.unplug * NANOSECONDS
-
-
-def _following(due: int, now: int, period: int) -> int:
-    """Return the next multiple after a due one, skipping what has been missed."""
-    return due + max(1, (now - due) // period + 1) * period

@@ -55,6 +55,7 @@ class CtrlpHost(LineHost):
         "the supply pressure is not reported by boards without a sensor for it",
     )
     echoes = True
+    reach = LARGEST_GAUGE * PASCAL_PER_KILOPASCAL
 
     def doubt(self) -> None:
         """Have the units confirmed again before the next setpoint."""

@@ -133,6 +133,7 @@ class FestoHost(HostProtocol):
     separator = b""
     echoes = True
     resolution = PASCAL_PER_MILLIBAR
+    reach = LARGEST_SETPOINT * PASCAL_PER_MILLIBAR
 
     _motion_terminal = True
 

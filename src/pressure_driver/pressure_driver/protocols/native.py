@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 VERSION = 1
 HEADER = struct.Struct("<BBH")
-HELLO_BODY = struct.Struct("<BiiIB")
+IDENTITY_HEAD = struct.Struct("<BiiIB")
 SETPOINT_HEAD = struct.Struct("<H")
 STATUS_HEAD = struct.Struct("<IHBII")
 LONGEST_FRAME = 256
@@ -168,10 +168,10 @@ class NativeHost(HostProtocol):
         return []
 
     def _identity(self, body: bytes) -> list[Event]:
-        if len(body) < HELLO_BODY.size:
+        if len(body) < IDENTITY_HEAD.size:
             return []
-        count, low, high, _, length = HELLO_BODY.unpack_from(body)
-        text = body[HELLO_BODY.size :]
+        count, low, high, _, length = IDENTITY_HEAD.unpack_from(body)
+        text = body[IDENTITY_HEAD.size :]
         if len(text) != length or low > high:
             return []
         self.unsettled = ""
