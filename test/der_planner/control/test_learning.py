@@ -1,6 +1,7 @@
 """Learning from run to run, on limbs that are not the one of the plan."""
 
 import copy
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -287,6 +288,21 @@ def test_a_run_that_does_not_move_with_its_commands_is_refused(first):
     learner.add(first.time, simulate(other_limb(), first.time, commands=crossed).tip[:-1])
     assert "does not move with the commands" in learner.history[1].reason
     assert learner.next() is first
+
+
+@pytest.mark.parametrize(
+    ("turned", "reason"),
+    [
+        (lambda tip: tip[:, ::-1], "begins .* count from the clamp"),
+        (lambda tip: 0.0 * tip, "begins .* count from the clamp"),
+        (lambda tip: tip[0] + 0.0 * tip, "moved 0% of its way"),
+    ],
+)
+def test_tips_that_are_swapped_or_stand_still_teach_nothing(first, turned, reason):
+    learner = Learner(first)
+    learner.add(first.time, turned(first.tip_predicted))
+    assert not learner.history[0].accepted
+    assert re.search(reason, learner.history[0].reason)
 
 
 def test_chambers_are_told_in_any_order_with_gaps_and_refused_where_they_do_not_fit(first):

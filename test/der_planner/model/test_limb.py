@@ -78,6 +78,25 @@ def test_a_parameter_that_another_needs_may_not_be_zero():
         changed(Segment, creep_stiffness=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("part", "name", "value", "reason"),
+    [
+        ("segments", "bending_stiffness", 17_500.0, r"segments\[0\] would bend by .* N·m²"),
+        ("segments", "moment_gain", 9.1e-3, r"segments\[0\] would bend by .* N·m/Pa"),
+        ("segments", "mass_per_length", 1066.0, "weighs .* give mass_per_length in kg/m"),
+        ("pneumatics", "pressure_limit", 24.0, "would bend by .* pressure_limit in Pa"),
+        ("pneumatics", "slew_limit", 9.0, "more than 60 s: give .* slew_limit in Pa/s"),
+        ("pneumatics", "time_constant", 150.0, "more than 60 s: give time_constant"),
+    ],
+)
+def test_a_limb_file_in_other_units_is_refused(tmp_path, part, name, value, reason):
+    content = yaml.safe_load(DEFAULT_LIMB_FILE.read_text(encoding="utf-8"))
+    (content[part][0] if part == "segments" else content[part])[name] = value
+    (tmp_path / "limb.yaml").write_text(yaml.safe_dump(content))
+    with pytest.raises(LimbError, match=reason):
+        Limb.from_yaml(tmp_path / "limb.yaml")
+
+
 def test_free_text_and_long_text_of_a_limb_file_are_read_back(tmp_path):
     text = {"length": "tape measure", "note": "two lines\nlength: 3\ngravity: none"}
     limb = replace(LIMB, provenance=text, name="gravity: 3\nsegments:\n- length: 1")

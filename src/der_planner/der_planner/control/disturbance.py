@@ -44,8 +44,12 @@ _LEAST_CORRELATION = 0.5
 """Correlation of measured and expected tip of a limb that moves with its commands."""
 _LEAST_MOVEMENT = 0.15
 """Share of the expected movement that a limb makes that moves with its commands."""
-_STILL = 5e-3
+STILL = 5e-3
 """Expected movement below which nothing is told of a limb, root mean square [m]."""
+_ELSEWHERE = 0.4
+"""Share of a limb's length from which on its tip begins elsewhere than it can."""
+_FIRST = 5
+"""Setpoints at which a limb begins."""
 
 
 class LearningError(ValueError):
@@ -236,19 +240,38 @@ def moves_with(tip: Array, expected: Array) -> str:
     seen = np.isfinite(tip).all(axis=1)
     if not seen.any():
         return ""
-    one = tip[seen] - tip[seen].mean(axis=0)
-    other = expected[seen] - expected[seen].mean(axis=0)
-    moved, expected_movement = (
-        float(np.sqrt((part**2).sum() / seen.sum())) for part in (one, other)
-    )
-    if expected_movement < _STILL:
+    moved, expected_movement = movement(tip[seen]), movement(expected[seen])
+    if expected_movement < STILL:
         return ""
     if moved < _LEAST_MOVEMENT * expected_movement:
         return f"the tip moved {moved / expected_movement:.0%} of its way"
+    one, other = (part[seen] - part[seen].mean(axis=0) for part in (tip, expected))
     alike = float((one * other).sum() / seen.sum()) / (moved * expected_movement)
     if alike < _LEAST_CORRELATION:
         return f"the tip does not move with the commands (correlation {alike:.2f})"
     return ""
+
+
+def movement(tip: Array) -> float:
+    """Return the root mean square distance of tips (K, 2) from their mean [m]; 0 for none."""
+    return float(np.sqrt(tip.var(axis=0).sum())) if len(tip) else 0.0
+
+
+def elsewhere(shown: Shown, length: float) -> str:
+    """Return why the tips cannot be those of a limb where it begins; empty if they can.
+
+    Args:
+        shown: of the run.
+        length: of the limb [m].
+    """
+    first = shown.value[shown.seen][:_FIRST]
+    apart = float(np.linalg.norm(np.median(first, axis=0))) if len(first) else 0.0
+    if apart < _ELSEWHERE * length:
+        return ""
+    return (
+        f"the tip begins {apart * 1000:.0f} mm from where the model does: check that the tips "
+        "count from the clamp, x along the straight limb and y to its left, and what it carries"
+    )
 
 
 def without_gaps(value: Array, known: Mask, period: float, fade: float) -> Array:

@@ -81,7 +81,6 @@ class Feedback:
             self._benefit = Benefit(self._nominal)
             self._sense = TouchSense(self._nominal.model)
             self._reaction = Reaction(self._nominal.model, reaction, force_limit)
-            self._horizon.warm_up(self._estimator.beginning(0))
 
     @property
     def reason(self) -> str:
@@ -140,7 +139,7 @@ class Feedback:
         self._benefit.take_over(other._benefit)
         self._sense.free = other._sense.free
         # What ended the other's feedback does not count here.
-        self._supervisor.share = other.share
+        self._supervisor.share = other._supervisor.share
         self._supervisor.swings = other._supervisor.swings
 
     def pressures(self, time: float, differential: ArrayLike) -> None:

@@ -26,7 +26,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from der_planner.arrays import Array
+from der_planner.arrays import Array, interpolate
 from der_planner.estimation.knowledge import Knowledge
 from der_planner.estimation.nominal import ChamberLog, Nominal
 from der_planner.model import CONTROL_PERIOD, STEPS
@@ -89,7 +89,7 @@ class Horizon:
         self._nominal, self._chambers, self._authority = nominal, chambers, authority
         self._air, inputs = nominal.model.air, nominal.model.inputs
         self.window = _KNOTS[-1] + 1
-        self._hats = _hats(_KNOTS)
+        self._hats = interpolate(np.arange(self.window), np.array(_KNOTS), np.eye(len(_KNOTS)))
         self._guess: tuple[int, Array] | None = None
         weight, each = _CHANGE_LEARNED if nominal.is_learned else _CHANGE, np.eye(self.window + 2)
         weight /= self._air.pneumatics.pressure_limit
@@ -119,11 +119,6 @@ class Horizon:
         self.solution = first, best.correction
         correction_now: Array = best.correction[0]
         return correction_now
-
-    def warm_up(self, known: Knowledge) -> None:
-        """Compile, or load from the cache, what `solve` calls."""
-        self.solve(0, known)
-        self._guess, self.solution = None, (0, np.zeros_like(self.solution[1]))
 
     def _programme(self, here: _Rolled, known: Knowledge, free: Array) -> Array:
         """Return the change (W, M) [Pa] of corrections that is best to first order.
@@ -155,13 +150,9 @@ class Horizon:
         air, guess = self._air.pneumatics, here.correction
         planned = self._planned(here.first)
         least, most = self._bounds(here.first)
-        bounds: Array = np.stack(
-            [
-                np.maximum(least, -air.pressure_limit - planned) - guess,
-                np.minimum(most, air.pressure_limit - planned) - guess,
-            ]
-        )
-        low, high = np.sort(bounds, axis=0)
+        low = np.maximum(least, -air.pressure_limit - planned) - guess
+        high = np.minimum(most, air.pressure_limit - planned) - guess
+        low, high = np.minimum(low, high), np.maximum(low, high)  # a plan may round beyond a limit
         command = np.concatenate([self._chambers.sent(here.first - 1)[None], planned + guess])
         steps, largest = np.diff(command, axis=0), air.slew_limit * CONTROL_PERIOD
         moves = np.diff(self._hats, axis=0, prepend=0.0)
@@ -297,9 +288,3 @@ def _less(correction: Array, free: Array) -> Array:
     rest = -free
     rest[2:] += correction
     return rest
-
-
-def _hats(knots: tuple[int, ...]) -> Array:
-    """Return the weights (W, knots) of straight lines between knots."""
-    place = np.arange(knots[-1] + 1)
-    return np.stack([np.interp(place, knots, column) for column in np.eye(len(knots))], axis=1)

@@ -28,11 +28,14 @@ from numpy.typing import ArrayLike
 
 from der_planner.arrays import Array, interpolate
 from der_planner.control.disturbance import (
+    STILL,
     LearningError,
     Measured,
     Shown,
     chambers_beyond,
     disturbance,
+    elsewhere,
+    movement,
     moves_with,
     stays_behind,
 )
@@ -268,13 +271,15 @@ class Learner:
                 )
         expected = self._runs.expected(given) or self._correction.expected(given)
         shown = disturbance(measured, plan.time, expected.tip)
+        astray = elsewhere(shown, self._correction.model.limb.length)
         tip = np.where(shown.seen[:, None], expected.tip + shown.value, np.nan)
-        behind, astray = stays_behind(plan.time, tip, plan.tip_reference), ""
-        if behind is not None:
+        behind = stays_behind(plan.time, tip, plan.tip_reference)
+        if behind is not None and not astray:
             kept = shown.seen & (plan.time < behind)
+            follows = kept.mean() >= _LEAST_SEEN and movement(expected.tip[kept]) >= STILL
             # A limb that hardly ever follows may be far from its file, and teach all the same.
-            astray = moves_with(tip, expected.tip) if kept.mean() < _LEAST_SEEN else ""
-            if kept.mean() >= _LEAST_SEEN or astray:
+            astray = "" if follows else moves_with(tip, expected.tip)
+            if follows or astray:
                 shown = Shown(np.where(kept[:, None], shown.value, np.nan), shown.variance, kept)
         astray = astray or moves_with(expected.tip + shown.value, expected.tip)
         inside = (measured.time >= plan.time[0]) & (measured.time <= plan.time[-1])

@@ -14,9 +14,10 @@ than the plan would do harm where a touch is false.
 With a limit in N pressures go back slowly from where they are at the touch until its force can be
 told: it may be beyond the limit. They do not move along the obstacle, since its direction is not
 known well either. From then on the bound moves slowly to where the force f, with two deviations,
-would reach the limit: a change −ℓ·δu is taken to raise the force by |f|/|ℓ|² of it. Once the limb
-has gone back and nothing is touched, nor suspected, the bound moves on slowly until the plan is
-behind it.
+would reach the limit: a change −ℓ·δu is taken to raise the force by |f|/|ℓ|² of it. Pressures go
+back no farther than to vented chambers, beyond which the limb would be led away for nothing. Once
+nothing is touched, the bound moves on slowly until the plan is behind it, and slower still while a
+touch is suspected.
 """
 
 from __future__ import annotations
@@ -81,15 +82,10 @@ class Reaction:
                 f"with {kind}"
             )
         self.kind, self.limit = kind, limit
-        self.vents = False
+        self.vents, self._acts = False, kind != "warn"
         self._bound: _Bound | None = None
         self._free, self._kept = 1.0, np.zeros(model.inputs)
         self._newest, self._suspected = self._kept, False
-
-    @property
-    def acts(self) -> bool:
-        """Whether it may change commands."""
-        return self.kind != "warn"
 
     def follow(self, planned: Array, touch: Touch, chambers: Array) -> None:
         """Look at a touch, or that there is none, before a command is asked for.
@@ -99,9 +95,9 @@ class Reaction:
             touch: as it is known now.
             chambers: (M,) differential pressures in them now [Pa].
         """
-        self._suspected = touch.suspected and self.acts
+        self._suspected = touch.suspected and self._acts
         self.vents = self.kind == "vent" and touch.touched and touch.time > touch.since
-        if touch.touched and self.acts:
+        if touch.touched and self._acts:
             self._bound = self._bound_of(planned, touch, chambers)
         elif self._bound is not None:
             self._bound = self._bound_after(self._bound, planned)
@@ -115,7 +111,8 @@ class Reaction:
         size = float(np.linalg.norm(touch.force))
         if self.limit is None or not size > 0.0:
             bound = self._bound or _Bound(chambers, harder, False)
-            back = 0.0 if self.limit is None else _SPEED * CONTROL_PERIOD
+            most = 0.0 if self.limit is None else float(bound.harder @ bound.held)
+            back = max(0.0, min(most, _SPEED * CONTROL_PERIOD))
             return bound._replace(held=bound.held - back * bound.harder, slides=False)
         along = touch.force / size
         # Friction bears a part of the force: it may be larger by two standard deviations.
@@ -126,12 +123,13 @@ class Reaction:
     def _bound_after(self, bound: _Bound, planned: Array) -> _Bound | None:
         """Return what is left of a bound once nothing is touched."""
         held, harder, _ = bound
-        if self.kind == "yield" and self._suspected:
-            # Friction may hide a touch that goes on.
-            return _Bound(planned, harder, True) if self.limit is None else bound
-        if self.limit is not None and harder @ (planned - held) > 0.0:
-            return bound._replace(held=held + _SPEED * CONTROL_PERIOD * harder)
-        return None
+        # Friction may hide a touch that goes on.
+        if self.limit is None:
+            hidden = self.kind == "yield" and self._suspected
+            return _Bound(planned, harder, True) if hidden else None
+        speed = _SPEED / 3.0 if self._suspected else _SPEED
+        behind = harder @ (planned - held) <= 0.0
+        return None if behind else bound._replace(held=held + speed * CONTROL_PERIOD * harder)
 
     def corrected(self, wanted: Array) -> Array:
         """Return the correction (M,) [Pa] of this control period in place of a wanted one."""

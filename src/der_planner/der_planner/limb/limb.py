@@ -21,12 +21,24 @@ from numpy.typing import NDArray
 
 from der_planner.files import read_yaml, write_whole, yaml_text
 from der_planner.limb.declaration import LimbError, check, commented, effect, parameter, read
-from der_planner.limb.loads import BEYOND_THE_TIP, PAYLOAD, Load, PointMass, gravity_of, mounting_of
+from der_planner.limb.loads import (
+    BEYOND_THE_TIP,
+    HEAVIEST,
+    PAYLOAD,
+    Load,
+    PointMass,
+    gravity_of,
+    mounting_of,
+)
 from der_planner.limb.parameters import CalibratedRange, Pneumatics, Segment
 
 SCHEMA_VERSION = 1
 MOST_CARRIED = 10.0
 """Largest payload over what the limb weighs: more is a mistake in the unit."""
+LEAST_BEND, MOST_BEND = 0.01, 100.0
+"""Bend of a segment at the pressure limit that a limb can have [rad]."""
+SLOWEST = 60.0
+"""Largest time in which chambers follow their command, or fill at the slew limit [s]."""
 DEFAULT_LIMB_FILE = Path(__file__).resolve().parents[1] / "data" / "default_limb.yaml"
 
 
@@ -92,6 +104,27 @@ class Limb:
         for index, item in enumerate(self.masses):
             check(item, f"masses[{index}].")
             self._check_place(f"masses[{index}].arc_length", item.arc_length)
+
+    def _check_units(self) -> None:
+        """Refuse what no limb has: one of its numbers is in another unit."""
+        air = self.pneumatics
+        for index, bend in enumerate(self.static_gain * air.pressure_limit):
+            if not LEAST_BEND < bend < MOST_BEND:
+                raise LimbError(
+                    f"segments[{index}] would bend by {bend:.2g} rad at the pressure limit: give "
+                    "bending_stiffness in N·m², moment_gain in N·m/Pa, length in m and "
+                    "pressure_limit in Pa"
+                )
+        if self.mass > HEAVIEST:
+            raise LimbError(
+                f"the limb weighs {self.mass:.3g} kg: give mass_per_length in kg/m, masses in kg"
+            )
+        slowest = max(air.time_constant, air.vent_time_constant, air.delay)
+        if max(slowest, air.pressure_limit / air.slew_limit) > SLOWEST:
+            raise LimbError(
+                f"the chambers would take more than {SLOWEST:.0f} s: give time_constant and delay "
+                "in s, slew_limit in Pa/s"
+            )
 
     def _check_place(self, what: str, arc_length: float) -> None:
         """Refuse a mass beyond the limb."""
@@ -305,6 +338,7 @@ class Limb:
         if version != SCHEMA_VERSION:
             raise LimbError(f"schema_version is {version!r}: this program reads {SCHEMA_VERSION}")
         limb: Limb = read(cls, body)
+        limb._check_units()
         return limb
 
     def to_mapping(self) -> dict[str, Any]:
