@@ -84,8 +84,17 @@ def test_a_node_without_an_extra_names_it(monkeypatch, capsys, tmp_path):
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setitem(sys.modules, "nicegui", None)
     monkeypatch.setattr("limb_interfaces.entry.on_end_signals", lambda _: None)
+    monkeypatch.setattr(sys, "argv", ["node", "--ros-args", "-p", "port:=/dev/ttyACM0", "--"])
     assert run_module("lonely") == 1
     assert "pip install nicegui" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("words", "code"), [(["-p", "pressure_limit:=2.0"], 2), (["--help"], 0)])
+def test_a_node_takes_no_arguments_outside_of_ros_args(monkeypatch, capsys, words, code):
+    monkeypatch.setattr("limb_interfaces.entry.on_end_signals", lambda _: None)
+    monkeypatch.setattr(sys, "argv", ["node", *words, "--ros-args", "-p", "port:=/dev/ttyACM0"])
+    assert run_module("never_loaded") == code
+    assert f"'{' '.join(words)}' stands outside of --ros-args" in capsys.readouterr().err
 
 
 def test_every_package_has_the_version_of_the_project_also_where_it_is_installed():

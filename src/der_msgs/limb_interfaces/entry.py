@@ -35,9 +35,17 @@ def run_module(name: str) -> int:
         name: of the module.
 
     Returns:
-        What ``main`` returns, or 0; 1 where one of `EXTRAS` is missing, which is told.
+        What ``main`` returns, or 0; 1 where one of `EXTRAS` is missing, 2 for arguments that no
+        node takes; both are told.
     """
     on_end_signals(lambda *_: os._exit(0))
+    if left := _outside_of_ros_args(sys.argv[1:]):
+        print(
+            f"'{' '.join(left)}' stands outside of --ros-args. Parameters are given as "
+            "--ros-args -p NAME:=VALUE; docs/reference/nodes.md names them",
+            file=sys.stderr,
+        )
+        return 0 if left in (["-h"], ["--help"]) else 2
     try:
         exit_code = int(importlib.import_module(name).main() or 0)
     except ModuleNotFoundError as error:
@@ -49,3 +57,14 @@ def run_module(name: str) -> int:
     # A second signal must not change the exit code while Python takes itself down.
     on_end_signals(signal.SIG_IGN)
     return exit_code
+
+
+def _outside_of_ros_args(words: list[str]) -> list[str]:
+    """Return the words of a command line that ROS takes no notice of."""
+    left, is_of_ros = [], False
+    for word in words:
+        if word in ("--ros-args", "--"):
+            is_of_ros = word == "--ros-args"
+        elif not is_of_ros:
+            left.append(word)
+    return left

@@ -49,4 +49,7 @@ TWIN_GROUND_TRUTH = "twin/ground_truth"
 TWIN_PUSH = "twin/push"
 """A force on the twin."""
 
+CMD_U_T = "cmd_u_t"
+"""Untimed differences in hPa, which the driver takes where its parameter says so."""
+
 BASE_FRAME = "limb_base"

@@ -30,8 +30,12 @@ def write_whole(path: str | Path, text: str) -> None:
     file = Path(path)
     file.parent.mkdir(parents=True, exist_ok=True)
     unfinished = file.with_name(f".{file.name}.part")
-    unfinished.write_text(text, encoding="utf-8")
-    unfinished.replace(file)
+    try:
+        unfinished.write_text(text, encoding="utf-8")
+        unfinished.replace(file)
+    except OSError as error:
+        unfinished.unlink(missing_ok=True)
+        raise OSError(error.errno, error.strerror, str(file)) from error
 
 
 def write_columns(path: str | Path, columns: Mapping[str, NDArray[np.float64]]) -> None:

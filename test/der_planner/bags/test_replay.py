@@ -52,6 +52,16 @@ def test_part_choice_and_names(bag: Path):
     assert {topic for _, topic, _ in play(bag, topics=["/b"])} == {"", "/b"}
 
 
+def test_what_commands_is_played_only_where_it_is_named(tmp_path: Path):
+    writer = BagWriter(tmp_path / "run")
+    for name in ("/limb/state", "/limb/command", "/lab/arm/pressure_setpoint"):
+        writer.write(spec(name, TEXT), START, START, string(name))
+    bag = writer.close()
+    assert {topic for _, topic, _ in play(bag)} == {"", "/limb/state"}
+    named = play(bag, topics=["/limb/command"], remap={"/limb/command": "/old"})
+    assert {topic for _, topic, _ in named} == {"", "/old"}
+
+
 @pytest.mark.parametrize(
     ("wanted", "message"),
     [

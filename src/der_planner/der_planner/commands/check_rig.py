@@ -24,6 +24,7 @@ import numpy as np
 import yaml
 
 from apriltag_tracker.bodies.body_map import BodyMap
+from apriltag_tracker.installed import CONFIG
 from apriltag_tracker.pose.clamp import Clamp, at_clamp, find_clamp
 from apriltag_tracker.tag_map import MapError, TagMap
 from der_planner.bags.reader import BagError, BagReader
@@ -167,20 +168,20 @@ def _play(given: argparse.Namespace, hardware: Hardware) -> Path:
     folder = given.folder or Path("checks") / time.strftime("%Y-%m-%d_%H-%M-%S")
     check_folder(folder, "--folder")
     driver = hardware.limits
-    run = check_run(driver.segment_count, given.pressure or GENTLE * driver.pressure_limit)
+    most = 0.5 * driver.pressure_limit
+    pressure = GENTLE * driver.pressure_limit if given.pressure is None else given.pressure
+    if not 0.0 < pressure <= most:
+        raise OptionError(f"--pressure is {pressure:g}: choose up to {most:g} Pa, half the limit")
+    run = check_run(driver.segment_count, pressure)
     run = within_limits(run, np.inf, driver.slew_limit)  # the driver refuses what is beyond its own
     return play_calibration(run, folder.resolve(), Limb.default(), given.seed, hardware)
 
 
 def _map_path(hardware: Hardware) -> Path:
     """Return the file of the tracker's map of tags or bodies."""
-    # Only with ROS there is a share folder to look in.
-    from ament_index_python.packages import get_package_share_directory  # noqa: PLC0415
-
-    share = Path(get_package_share_directory("apriltag_tracker")) / "config"
     if hardware.poses is not None:
-        return Path(hardware.poses.get("body_map", share / "bodies.yaml"))
-    return Path(hardware.tracker.get("tag_map", share / "tags.yaml"))
+        return Path(hardware.poses.get("body_map", CONFIG / "bodies.yaml"))
+    return Path(hardware.tracker.get("tag_map", CONFIG / "tags.yaml"))
 
 
 def played_wiring(finding: RigFinding, driver: Mapping[str, Any]) -> str:

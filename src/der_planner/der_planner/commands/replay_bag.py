@@ -30,9 +30,19 @@ from der_planner.experiment.client import GraphClient
 from der_planner.experiment.console import OptionError, Progress, command, interrupt_once
 from der_planner.experiment.processes import GraphError
 from limb_interfaces import qos
+from limb_interfaces import topics as names
 
 CLOCK_PERIOD = NANOSECONDS // 100
 """Recorded time between two messages on ``/clock`` [ns] while nothing else is due."""
+COMMANDING = (
+    names.COMMAND,
+    names.PATH,
+    names.PRESSURE_SETPOINT,
+    names.CMD_U_T,
+    names.OPERATOR_LEASE,
+    names.TWIN_PUSH,
+)
+"""Topics by which a limb, or its twin, moves."""
 DEPTH = 100
 """So many messages of a topic may wait for their receivers, and answers for this program."""
 ATTEMPTS = 3
@@ -52,7 +62,7 @@ class Selection:
     Attributes:
         start: seconds after the bag's first message at which to begin.
         stop: seconds after it at which to end; None = the bag's end.
-        topics: only these recorded names; all if empty.
+        topics: only these recorded names; if empty, all that command nothing.
         remap: recorded name to the name to publish on.
     """
 
@@ -78,6 +88,11 @@ class Selection:
         return first, last
 
 
+def commands(topic: str) -> bool:
+    """Tell whether a limb may move by what is published on a topic."""
+    return topic.endswith(tuple(f"/{name}" for name in COMMANDING))
+
+
 def choose_topics(bag: BagReader, wanted: Selection) -> dict[str, RecordedTopic]:
     """Return the topics to play by the name to publish on.
 
@@ -89,7 +104,7 @@ def choose_topics(bag: BagReader, wanted: Selection) -> dict[str, RecordedTopic]
         if name not in known:
             raise BagError(f"{bag.path} has no topic {name}, only {', '.join(sorted(known))}")
     chosen: dict[str, RecordedTopic] = {}
-    for name in wanted.topics or known:
+    for name in wanted.topics or [each for each in known if not commands(each)]:
         target = wanted.remap.get(name, name)
         if target in chosen:
             raise BagError(f"{chosen[target].name} and {name} would both be played on {target}")
@@ -219,7 +234,13 @@ def _options(parser: argparse.ArgumentParser) -> argparse.Namespace:
     parser.add_argument("--rate", type=float, default=1.0, help="0: as fast as possible")
     parser.add_argument("--from", dest="start", type=float, default=0.0, metavar="S")
     parser.add_argument("--to", dest="stop", type=float, default=None, metavar="S")
-    parser.add_argument("--topics", nargs="+", default=[], metavar="TOPIC", help="only these")
+    parser.add_argument(
+        "--topics",
+        nargs="+",
+        default=[],
+        metavar="TOPIC",
+        help="only these (default: all that command nothing)",
+    )
     parser.add_argument("--remap", nargs="+", default=[], metavar="OLD=NEW")
     parser.add_argument("--step-by", default="", metavar="TOPIC=ANSWER", help="wait for answers")
     parser.add_argument(
@@ -261,8 +282,11 @@ def main(parser: argparse.ArgumentParser) -> int:
                 output.publish(topic, message)
                 count += 1
             progress.bar(since, (last - first) / NANOSECONDS, "played")
+        left = [] if wanted.topics else sorted(filter(commands, bag.topics))
         time.sleep(0.2)  # the last messages leave the process
     print(f"published {count} messages of {len(topics)} topics")
+    if left:
+        print(f"left out, since a limb would move by them: {', '.join(left)} (--topics plays them)")
     if count == 0:
         print(
             "error: no message of the chosen topics lies between --from and --to", file=sys.stderr

@@ -70,7 +70,9 @@ class GraphClient:
 
     def _keep_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
-            self.diagnostics[status.name.rsplit("/", 1)[-1]] = status
+            space, _, name = status.name.rpartition("/")
+            if space == f"/{topics.NAMESPACE}":  # another limb has nodes of the same names
+                self.diagnostics[name] = status
 
     def watch(self, processes: Iterable[NodeProcess]) -> None:
         """Raise from every waiting method as soon as one of these processes has ended."""

@@ -24,6 +24,7 @@ from der_planner.experiment.processes import (
     PAGE_TOKEN,
     GraphError,
     GraphSetup,
+    NodeError,
     NodeProcess,
     NodeSpec,
     board_line,
@@ -263,7 +264,7 @@ class RunningGraph:
         self.client.call("recorder/stop", timeout=60.0)
 
     def _vent(self) -> None:
-        self.client.call("pressure_driver/vent")
+        self.client.call("pressure_driver/vent", timeout=5.0)
         self.client.newest.pop(topics.PRESSURE_STATE, None)
 
         def vented() -> bool:
@@ -275,21 +276,20 @@ class RunningGraph:
         self.client.wait_for(vented, 30.0, "the chambers to vent")
 
     def vent_after_error(self) -> None:
-        """Vent; where the driver has died, the process of its port does it by itself."""
+        """Vent; where the driver has died, the process of its port should, which nobody sees."""
         driver = self.processes.get("pressure_driver")
         if driver is None and "pressure_driver" not in self.elsewhere:
             return
         self.progress.say("  venting the limb")
-        self.client.watch(())
+        self.client.watch(() if driver is None else (driver,))
         try:
-            if driver is None or driver.alive:
-                self._vent()
-            else:
-                self.client.spin(PORT_VENTS)
-        except GraphError as error:
+            self._vent()
+        except (GraphError, NodeError) as error:
             self.progress.say(
                 f"  WARNING: the limb may still be under pressure ({error}); close its air supply"
             )
+            self.client.watch(())
+            self.client.spin(PORT_VENTS)
 
     def stop(self) -> None:
         """Stop every node, in the reverse of the order in which they were started."""
@@ -317,30 +317,24 @@ def experiment_page(options: Options, progress: Progress) -> Iterator[NodeProces
     page = NodeProcess(
         spec.package, spec.executable, parameters, options.out / "logs", setup.rig.remap
     )
-    try:
-        with GraphClient(EXPERIMENT) as client:
-            client.watch([page])
-            client.wait_ready(["page"])
-            progress.say(
-                f"the operator's page is at {client.diagnostic_values('page')['url']}"
-                f"?token={PAGE_TOKEN}"
-            )
-            DiagnosticsPublisher(
-                client.node, lambda: Health("error" if progress.failed else "ok", progress.newest)
-            )
-            client.watch(())
-            ended = threading.Event()
-            speaker = threading.Thread(
-                target=_speak, args=(client, ended), name=EXPERIMENT, daemon=True
-            )
-            speaker.start()
-            try:
-                yield page
-            finally:
-                ended.set()
-                speaker.join(1.0)
-    finally:
-        page.stop()
+    with contextlib.ExitStack() as stack:
+        stack.callback(page.stop)
+        client = stack.enter_context(GraphClient(EXPERIMENT))
+        client.watch([page])
+        client.wait_ready(["page"])
+        url = client.diagnostic_values("page")["url"]
+        progress.say(f"the operator's page is at {url}?token={PAGE_TOKEN}")
+        DiagnosticsPublisher(
+            client.node, lambda: Health("error" if progress.failed else "ok", progress.newest)
+        )
+        client.watch(())
+        ended = threading.Event()
+        arguments = (client, ended)
+        speaker = threading.Thread(target=_speak, args=arguments, name=EXPERIMENT, daemon=True)
+        speaker.start()
+        stack.callback(speaker.join, 1.0)
+        stack.callback(ended.set)
+        yield page
 
 
 def _speak(client: GraphClient, ended: threading.Event) -> None:

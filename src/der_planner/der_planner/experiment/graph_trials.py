@@ -96,13 +96,14 @@ def play_on_graph(run: TrialRun, progress: Progress) -> dict[str, Any]:
 
 
 def _bag_folder(out: Path, name: str) -> Path:
-    """Return the folder of a run's bag; the bag of a run that was stopped goes to ``stopped/``."""
-    bag, number = out / "bags" / name, 1
-    while (kept := out / "stopped" / f"{name}_{number}").exists():
+    """Return the folder of a run's bag; what a stopped run has left goes to ``stopped/``."""
+    bag, logs, stopped, number = out / "bags" / name, out / "logs" / name, out / "stopped", 1
+    while (stopped / f"{name}_{number}").exists() or (stopped / f"{name}_{number}_logs").exists():
         number += 1
-    if bag.exists():
-        kept.parent.mkdir(exist_ok=True)
-        bag.rename(kept)
+    for left, kept in ((bag, f"{name}_{number}"), (logs, f"{name}_{number}_logs")):
+        if left.exists():
+            stopped.mkdir(exist_ok=True)
+            left.rename(stopped / kept)
     return bag
 
 
@@ -120,10 +121,8 @@ def _planner_parameters(run: TrialRun) -> dict[str, Any]:
         parameters["learned_plans"] = str(run.learned.parent)
     elif options.path is not None:
         # A path names no model: it gets the planner's defaults.
-        parameters["default_model"] = trial.model
+        parameters |= {"default_model": trial.model, "default_method": trial.method}
         parameters["nearest_path"] = options.nearest
-        if trial.model == "der":
-            parameters["default_method"] = trial.method
     return parameters
 
 
