@@ -11,6 +11,7 @@ import importlib
 import json
 import os
 import platform
+import re
 import time
 from pathlib import Path
 
@@ -32,13 +33,9 @@ PARTS = {
 
 def machine() -> dict[str, str | int]:
     """Describe the machine that the figures belong to."""
-    model = platform.processor()
-    for line in Path("/proc/cpuinfo").read_text().splitlines():
-        if line.startswith("model name"):
-            model = line.split(":", 1)[1].strip()
-            break
+    model = re.search(r"model name\s*: (.+)", Path("/proc/cpuinfo").read_text())
     return {
-        "processor": model,
+        "processor": model[1] if model else platform.processor(),
         "cores": os.cpu_count() or 0,
         "system": platform.platform(),
         "python": platform.python_version(),

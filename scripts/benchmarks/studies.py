@@ -10,11 +10,11 @@ import time
 from pathlib import Path
 
 import psutil
-from distributed import Client, LocalCluster
+from distributed import Client
 
 from benchmarks import show
 from der_planner.experiment.console import Progress
-from der_planner.studies.conduct import PlaySettings, conduct
+from der_planner.studies.conduct import PlaySettings, conduct, local_cluster
 from der_planner.studies.study import Study
 
 Figures = dict[str, float | str]
@@ -60,23 +60,12 @@ def _played(text: str, folder: Path, scheduler: str) -> float:
     return wall
 
 
-def _cluster(workers: int) -> LocalCluster:
-    return LocalCluster(
-        n_workers=workers,
-        threads_per_worker=1,
-        processes=True,
-        host="127.0.0.1",
-        dashboard_address=None,
-        memory_limit=0,
-    )
-
-
 def _speed_up(folder: Path, quick: bool) -> Figures:
     """Compare one with two workers that have started, in the same runs on the twin."""
     count, period = (8, 4) if quick else (40, 10)
     walls = {}
     for workers in (1, 2):
-        with _cluster(workers) as cluster:
+        with local_cluster(workers) as cluster:
             address = cluster.scheduler_address
             # Each worker loads its kernels with its first run.
             _played(_RUNS.format(count=4 * workers, period=0.5), folder, address)
@@ -91,7 +80,7 @@ def _speed_up(folder: Path, quick: bool) -> Figures:
 def _memory_of_a_worker(folder: Path, quick: bool) -> Figures:
     """Measure the memory of a worker after rows that hardly cost anything themselves."""
     figures: Figures = {}
-    with _cluster(1) as cluster, Client(cluster) as client:
+    with local_cluster(1) as cluster, Client(cluster) as client:
         for count in (10, 100) if quick else (10, 100, 1000):
             _played(_TASKS.format(count=count), folder, cluster.scheduler_address)
             figures[f"memory_after_{count}_rows_mb"] = max(client.run(_memory).values())

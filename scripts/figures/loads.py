@@ -29,6 +29,7 @@ HELD = ((0.0, 0.0), (10e3, 0.0), (8e3, 8e3), (10e3, -10e3))
 HOLD = 8.0
 """For so long [s]."""
 COLORS = {"truth": "k", "der": "tab:green", "pcc": "tab:orange"}
+LABELS = {"truth": "twin", "der": "DER", "pcc": "PCC"}
 
 Array = NDArray[np.float64]
 
@@ -65,8 +66,7 @@ def draw_shapes(path: Path, seed: int) -> None:
             shapes |= {model: model_shape(limb, model, pressure) for model in MODELS}
             for name, points in shapes.items():
                 width = 3.0 if name == "truth" else 1.3
-                label = name.upper() if held == HELD[0] and name != "truth" else None
-                label = "twin" if held == HELD[0] and name == "truth" else label
+                label = LABELS[name] if held == HELD[0] else None
                 axis.plot(*(points.T * 100), color=COLORS[name], lw=width, label=label,
                           alpha=0.35 if name == "truth" else 1.0)  # fmt: skip
             apart = {

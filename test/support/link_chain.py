@@ -130,11 +130,12 @@ class LinkChain:
         inlet = np.sqrt(SUPPLY) * generator.uniform(0.18, 0.24, (SEGMENTS, 2))
         outlet = 50.6 * generator.uniform(0.92, 1.08, (SEGMENTS, 2))
         self._air = Air(inlet, outlet, SUPPLY)
+        self._viscosity = np.zeros(count)
         free = self._links(np.zeros(2), ())
         first = _first_frequency(free)
         self._viscosity = 2.0 * DAMPING_RATIO / first * self._stiffness
 
-    def _links(self, gravity: Array, masses: Sequence[Mass], factor: ArrayLike = 1.0) -> Links:
+    def _links(self, gravity: Array, masses: Sequence[Mass], factor: float = 1.0) -> Links:
         count = len(self._lengths)
         mass = MASS_PER_LENGTH * self._lengths
         first, second = 0.5 * mass * self._lengths, mass * self._lengths**2 / 3.0
@@ -154,11 +155,11 @@ class LinkChain:
             inertia=inertia,
             first=first,
             stiffness=self._stiffness,
-            viscosity=getattr(self, "_viscosity", np.zeros(count)),
+            viscosity=self._viscosity,
             hardening=self._hardening,
             rest=self._rest[self._owner] / PER_SEGMENT,
             owner=self._owner,
-            gain=self._gain * np.broadcast_to(factor, (SEGMENTS,))[:, None],
+            gain=self._gain * factor,
             width=SLIP_WIDTH,
             slip=self._slip,
             gravity=gravity,
@@ -187,7 +188,7 @@ class LinkChain:
         """
         self._generator = np.random.default_rng([self.seed, run])
         self._noise = noise
-        self._factor = np.ones(SEGMENTS)
+        self._factor = 1.0
         self.push(0.0, (0.0, 0.0))
         self._time = 0.0
         count = len(self._lengths)
@@ -224,9 +225,9 @@ class LinkChain:
         advance(self._state, held, duration / steps, steps, *self._push, self._built, self._air)
         self._time += duration
 
-    def change_gain(self, factor: ArrayLike) -> None:
-        """Scale the gains from now on, by one factor or one a segment (M,)."""
-        self._factor = np.broadcast_to(np.asarray(factor, dtype=float), (SEGMENTS,)).copy()
+    def change_gain(self, factor: float) -> None:
+        """Scale the gains from now on."""
+        self._factor = factor
         self._rebuild()
 
     def push(self, at: float, force: ArrayLike) -> None:
@@ -273,7 +274,7 @@ class LinkChain:
         noise: float = 1.0,
         run: int = 0,
         swing: ArrayLike = (0.0, 0.0),
-        gains: Sequence[tuple[float, ArrayLike]] = (),
+        gains: Sequence[tuple[float, float]] = (),
     ) -> Record:
         """Play commands from rest and film them.
 
@@ -282,7 +283,7 @@ class LinkChain:
             commands: (K, M) [Pa].
             camera_rate: [Hz]; the first image is at ``time[0]``. 0: images at ``time``.
             noise, run, swing: as of `reset`.
-            gains: (instant [s], factor or (M,) factors) on the gains from then on.
+            gains: (instant [s], factor) on the gains from then on.
         """
         instants, wanted = np.asarray(time, dtype=float), np.asarray(commands, dtype=float)
         end = instants[-1] + 0.05

@@ -68,10 +68,7 @@ class WorldTag:
         """Return the corners in `limb_base`, (4, 3) m, lower left first, counter-clockwise."""
         cosine, sine = math.cos(self.yaw), math.sin(self.yaw)
         turned = UNIT_CORNERS @ np.array([[cosine, sine], [-sine, cosine]]) * self.size
-        corners = np.empty((4, 3))
-        corners[:, :2] = turned + np.array(self.position[:2])
-        corners[:, 2] = self.position[2]
-        return corners
+        return np.asarray(np.column_stack([turned, np.zeros(4)]) + self.position)
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ def ring(nodes: int, twist: float) -> tuple[Rod, RodState]:
         length=1.0 + 1.0 / nodes, nodes=count, EI=EI, EA=2e5, GJ=GJ, mass_per_length=1.0,
         clamp="inside", fixed=held, segments=[(0, count)], moment_gain=[1.0],
     )  # fmt: skip
-    bent = PolylineKinematics.of_rod(rod)
+    bent = PolylineKinematics(rod)
     state = rod.straight_state()
     for part in np.linspace(0.02, 1.0, 50):
         state = rod.state(bent.configuration([part * 2 * np.pi]), like=state)

@@ -1,14 +1,7 @@
 """scripts/learn.py: from bags to the next plan, and what it refuses."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent.parent / "bags"))
-sys.path.insert(0, str(Path(__file__).parent.parent / "results"))
-
 from runs import BagOfRun
 
 from der_planner.commands import learn

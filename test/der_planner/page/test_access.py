@@ -206,7 +206,7 @@ def parts(driver: Driver) -> Parts:
         picture=PictureFeed(15.0),
         overlay=Overlay(TagMap((0.12, 0.12), (LimbTag(0, 0.2, 0.03, 0.015),), ())),
         desk=Desk(),
-        commands=Commands(driver, situation, 2),  # type: ignore[arg-type]
+        commands=Commands(driver, situation),  # type: ignore[arg-type]
         previewer=Previewer(Limb.default(), PathLimits(), Load()),
         drawings=DrawingFolder(Path("nowhere")),
     )

@@ -39,7 +39,7 @@ class Graph:
         self.situation.put_status(status("/limb/planner", **self._say(command.plan_id)))
 
     def play(self) -> Answer:
-        page = Commands(self, self.situation, 2)  # type: ignore[arg-type]
+        page = Commands(self, self.situation)  # type: ignore[arg-type]
         return asyncio.run(page.play(MotionCommand(motion="star", model="der")))
 
 

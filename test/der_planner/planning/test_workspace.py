@@ -43,7 +43,7 @@ def test_a_stiff_base_moves_the_limb_along_x():
     based = replace(LIMB, base_length=7e-3)
     model, rod = RodModel(based), Rod.from_limb(based, 21)
     angles = [0.9, -0.4]
-    q = PolylineKinematics.of_rod(rod).configuration(angles)
+    q = PolylineKinematics(rod).configuration(angles)
     np.testing.assert_allclose(model.kinematics.nodes(angles), rod.positions(q)[:, :2], atol=1e-14)
     for with_base, without in ((model.kinematics, CHAIN), (ArcModel(based), ARCS)):
         np.testing.assert_allclose(

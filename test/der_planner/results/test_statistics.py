@@ -226,6 +226,12 @@ def test_ways_of_playing_stand_side_by_side():
     assert row["learned_feedback_m"] is None
     assert "0.100" in side_by_side_table(results).text()
     assert not side_by_side_table(results[:1]).rows
+    # Runs under other loads are not of the same row.
+    hanging = [replace(run, mounting="hanging", mean_error_m=0.009) for run in results[:2]]
+    bare, loaded = side_by_side([*results[:2], *hanging])
+    assert (bare["open_loop_m"], loaded["open_loop_m"]) == (0.004, 0.009)
+    assert loaded["loads"] == "hanging"
+    assert side_by_side([results[0], hanging[1]]) == []
 
 
 def test_constant_offset_is_the_error_and_the_bias():

@@ -46,7 +46,7 @@ def test_static_bend_angles_are_those_of_the_segments(connector):
     expected = limb.static_gain * u + [0.8 * 0.1, -0.5 * 0.15]
     state = rod.equilibrium(u)
     np.testing.assert_allclose(bend_angles(rod, state.q), expected, rtol=3e-3)
-    q = PolylineKinematics.of_rod(rod).configuration(bend_angles(rod, state.q))
+    q = PolylineKinematics(rod).configuration(bend_angles(rod, state.q))
     np.testing.assert_allclose(q, state.q, atol=1e-9)
 
 

@@ -83,7 +83,7 @@ def node_forces(force):
 def test_bending_forces_of_an_even_bend_are_two_couples(turn, plane):
     """Theorem 1: nothing inside, and |F| = 4 EI sinθ / (l ē (1 + cosθ)²) at the four end nodes."""
     rod = segment_rod(plane=plane)
-    q = PolylineKinematics.of_rod(rod).configuration([turn * 10])
+    q = PolylineKinematics(rod).configuration([turn * 10])
     forces = node_forces(rod.internal_force(q))
     step = rod.rest_lengths[0]
     magnitude = 4 * EI * abs(np.sin(turn)) / (step * step * (1 + np.cos(turn)) ** 2)
@@ -96,7 +96,7 @@ def test_bending_forces_of_an_even_bend_are_two_couples(turn, plane):
 def test_input_matrix_is_the_direction_against_bending():
     """Corollary 1: each segment's unit couples are −F_b/|F_b|, the connector carries nothing."""
     rod = segment_rod(segments=((0, 6), (6, 6)))
-    q = PolylineKinematics.of_rod(rod).configuration([0.5, 0.8])
+    q = PolylineKinematics(rod).configuration([0.5, 0.8])
     forces = node_forces(rod.internal_force(q))
     matrix = rod.input_matrix(q) / rod.input_gain
     for index, (first, count) in enumerate(rod.segments):

@@ -129,9 +129,7 @@ def calibrate_camera(
             "by 20 to 40 degrees"
         )
     return CameraCalibration(
-        intrinsics=Intrinsics.create(
-            width, height, matrix, distortion, "rational_polynomial" if rational else "plumb_bob"
-        ),
+        intrinsics=Intrinsics.create(width, height, matrix, distortion),
         rms=rms,
         pictures=len(used),
         left_out=left_out,

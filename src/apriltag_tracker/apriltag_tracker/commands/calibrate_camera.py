@@ -74,12 +74,12 @@ def from_bag(path: Path, topic: str, every: float) -> Iterator[Picture]:
         ]
         if not wanted:
             raise CalibrationError(f"no images{f' on {topic}' if topic else ''} in {path}")
-        due = 0
+        due, images = 0, ImageReader()
         for link, stamp, raw in reader.messages(connections=wanted[:1]):
             if stamp < due:
                 continue
             due = stamp + round(every * 1e9)
-            picture = ImageReader().to_grey(reader.deserialize(raw, link.msgtype))
+            picture = images.to_grey(reader.deserialize(raw, link.msgtype))
             yield f"{stamp * 1e-9:.2f} s", picture
 
 
@@ -88,6 +88,7 @@ def from_topic(topic: str, count: int, every: float) -> Iterator[Picture]:
     rclpy.init()
     node = Node("calibrate_camera")
     came: list[Image] = []
+    images = ImageReader()
     node.create_subscription(Image, topic, came.append, qos.IMAGES)
     try:
         for number in range(count):
@@ -100,7 +101,7 @@ def from_topic(topic: str, count: int, every: float) -> Iterator[Picture]:
                 if time.monotonic() > due + 10.0:
                     raise CalibrationError(f"no image on {topic} for 10 s: does the camera run?")
             print(f"picture {number + 1} of {count}: move the board", file=sys.stderr, flush=True)
-            yield f"picture {number + 1}", ImageReader().to_grey(came[-1])
+            yield f"picture {number + 1}", images.to_grey(came[-1])
     finally:
         node.destroy_node()
         with contextlib.suppress(Exception):

@@ -151,7 +151,7 @@ def fit_curve(
     for _ in range(_PASSES):
         places, slopes = evaluation.places(parameters)
         gaps = measured - places
-        gaps[:, 2] = wrap(gaps[:, 2])
+        gaps[:, 2] = (gaps[:, 2] + np.pi) % (2.0 * np.pi) - np.pi
         rows = (whiten @ slopes).reshape(-1, size)
         normal = rows.T @ rows + weak
         right = rows.T @ (whiten @ gaps[:, :, None]).ravel() - weak @ parameters
@@ -165,8 +165,3 @@ def fit_curve(
     gain = np.asarray((by_rows @ whiten)[:, :, 0], dtype=np.float64)
     left_open = (np.eye(size) - np.tensordot(gain, slopes, 2)) * prior_sigma
     return CurveFit(parameters, gain, gaps, np.asarray(left_open, dtype=np.float64))
-
-
-def wrap(angle: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return angles between −π and π."""
-    return np.asarray((angle + np.pi) % (2.0 * np.pi) - np.pi)

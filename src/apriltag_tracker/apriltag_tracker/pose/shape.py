@@ -224,7 +224,7 @@ class ShapeFitter:
         kept, rejected, arcs = self._consistent(list(tags))
         if arcs is None:
             return None
-        fit = self._solve(self._smooth, kept, self._last)
+        fit = self._solve(self._smooth, kept)
         self._last = fit.parameters
         order = [i for i, tag in enumerate(tags) if tag.id not in rejected]
         none = np.zeros((len(tags), PLACE, 1))
@@ -244,7 +244,7 @@ class ShapeFitter:
         """
         kept, rejected = list(tags), {}
         while kept:
-            arcs = self._solve(self._constant, kept, self._last)
+            arcs = self._solve(self._constant, kept)
             furthest = _furthest(arcs)
             if furthest < 0.5 * self._reject_beyond or len(kept) < 3:
                 break
@@ -264,10 +264,7 @@ class ShapeFitter:
             Its index, its distance from the arcs through the others, and the largest residual of
             these others [m].
         """
-        fits = [
-            self._solve(self._constant, [*tags[:i], *tags[i + 1 :]], self._last)
-            for i in range(len(tags))
-        ]
+        fits = [self._solve(self._constant, [*tags[:i], *tags[i + 1 :]]) for i in range(len(tags))]
         rest = [_furthest(fit) for fit in fits]
         outside = int(np.argmin(rest))
         tag = tags[outside]
@@ -282,12 +279,7 @@ class ShapeFitter:
         mean = [prior.curvature] * curve.segments
         return np.array(base + mean + list(prior.corrections[: curve.degrees]) * curve.segments)
 
-    def _solve(
-        self,
-        curve: Curve,
-        tags: Sequence[PlanarTag],
-        start: NDArray[np.float64],
-    ) -> CurveFit:
+    def _solve(self, curve: Curve, tags: Sequence[PlanarTag]) -> CurveFit:
         """Find the most probable parameters and the gain (size, n, 3) from measurements to them."""
         evaluation = self._evaluation(curve, tuple(tag.arc_length for tag in tags))
         prior = self._prior
@@ -300,7 +292,7 @@ class ShapeFitter:
             np.array([tag.pose for tag in tags]),
             covariances + np.diag([position, position, heading]) ** 2,
             self._prior_sigma(curve),
-            start[: curve.size],
+            self._last[: curve.size],
         )
 
     def _estimate(

@@ -110,6 +110,7 @@ class WorldPose:
         """Tell whether most fixed tags have been elsewhere than their mean for a few frames."""
         averaged = [tag for tag in known if tag.id in self._seen]
         if not averaged:
+            self._shift, self._shifted = 0.0, 0
             return False
         gaps = np.array([tag.corners - self._seen[tag.id].corners for tag in averaged])
         shifts = sorted(np.hypot(*gaps.mean(axis=1).T).tolist())

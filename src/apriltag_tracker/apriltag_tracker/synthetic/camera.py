@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -114,7 +114,7 @@ class RenderedPicture:
     """
 
     image: NDArray[np.uint8]
-    corners: dict[int, NDArray[np.float64]] = field(default_factory=dict)
+    corners: dict[int, NDArray[np.float64]]
 
 
 class SyntheticCamera:
@@ -153,11 +153,11 @@ class SyntheticCamera:
         self._background, self._world = self._make_background(self._draw_world())
         self._noise_starts = np.zeros(len(tags.limb), dtype=np.int64)
 
-    def frame(self, shape: Shape | None, velocity: Shape | None = None) -> RenderedPicture:
+    def frame(self, shape: Shape, velocity: Shape | None = None) -> RenderedPicture:
         """Render one picture.
 
         Args:
-            shape: the limb at mid-exposure; None leaves it out.
+            shape: the limb at mid-exposure.
             velocity: the shape one second later at the present velocity minus the shape itself, in
                 the same arrays; blurs what moves.
         """
@@ -168,13 +168,10 @@ class SyntheticCamera:
         image = np.empty((rows, columns), dtype=np.uint8)
         cv2.add(self._background, self._brighter[noise].reshape(rows, columns), image)
         cv2.subtract(image, self._darker[noise].reshape(rows, columns), image)
-        result = RenderedPicture(image, dict(self._world))
-        if shape is not None:
-            self._draw_body(image, shape)
-            placed = place_tags(self._mounts, self._exposure, shape, velocity)
-            drawn = self._draw_tags(image, self.tags.limb, self._prints, self._noise, placed)
-            result.corners.update(drawn)
-        return result
+        self._draw_body(image, shape)
+        placed = place_tags(self._mounts, self._exposure, shape, velocity)
+        drawn = self._draw_tags(image, self.tags.limb, self._prints, self._noise, placed)
+        return RenderedPicture(image, self._world | drawn)
 
     def _draw_tags(
         self,

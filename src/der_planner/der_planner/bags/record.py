@@ -254,8 +254,6 @@ def read_record(path: str | Path) -> BagRecord:
     with BagReader(path) as bag:
         try:
             limbs, clocks = _collect(bag)
-        except BagError:
-            raise
         except Exception as error:  # rosbags raises many kinds for damaged content
             raise BagError(
                 f"the bag {path} is damaged: {error}. scripts/recover_bag.py {path} saves what is "

@@ -79,14 +79,13 @@ def add_run(learner: Learner, run: RunSeries) -> None:
     Raises:
         LearningError: the run's plan has another grid of setpoints, or its arrays do not fit.
     """
-    given = run.tip_covariance.value
-    whole = len(given) == len(run.tip) and bool(np.isfinite(given).any())
-    measured = run.measured
+    covariance, measured = run.tip_covariance.value, run.measured
+    known = len(covariance) == len(run.tip) and bool(np.isfinite(covariance).any())
     try:
         learner.add(
             run.tip.time,
             run.tip.value,
-            given.reshape(-1, 2, 2) if whole else None,
+            covariance.reshape(-1, 2, 2) if known else None,
             commands=run.setpoints.value,
             chambers=(measured.time, measured.value) if len(measured) else None,
         )
@@ -130,9 +129,7 @@ def plan_of(run: RunSeries, given: argparse.Namespace) -> Plan:
     if given.plan:
         return read_plan(given.plan)
     told = run.description
-    limb = Limb.from_yaml(given.limb)
-    if any(told.gravity):
-        limb = dataclasses.replace(limb, gravity=told.gravity)
+    limb = dataclasses.replace(Limb.from_yaml(given.limb), gravity=told.gravity)
     limb = limb.loaded(Load(told.payload, told.payload_at))
     if given.path:
         motion = Motion.from_csv(given.path, nearest=DRAWN in told.extra)

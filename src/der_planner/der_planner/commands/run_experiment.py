@@ -156,6 +156,7 @@ class Ledger:
             "obstacles_sha256": _digest(options.obstacles),
             "reaction": options.reaction,
             "force_limit": options.force_limit or "",
+            "library": str(options.library or ""),
         }
 
     def finished(self, trial: Trial) -> dict[str, Any] | None:

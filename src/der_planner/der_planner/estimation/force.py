@@ -61,7 +61,6 @@ class Touch:
         force_covariance: (2, 2), told or not [N²].
         said: a sentence on what is told; empty while nothing touches or pulls.
         payload: at the tip, beside what was planned [kg].
-        weighed: whether what touches may yet turn out to be a payload.
         suspected: whether something touches, or may touch while friction hides it.
     """
 
@@ -77,16 +76,14 @@ class Touch:
     force_covariance: Array
     said: str
     payload: float = 0.0
-    weighed: bool = False
     suspected: bool = False
 
 
 def untouched(time: float, bend_angles: Array, distance: float = 0.0) -> Touch:
     """Return that nothing touches a limb of bend angles (M,) [rad] at an instant [s]."""
-    nothing = np.full(2, np.nan)
-    unknown = np.full((2, 2), np.nan)
-    pressure, never = np.full(len(bend_angles), np.nan), np.nan
-    about = pressure, distance, np.nan, np.nan, nothing, unknown, ""
+    never = unknown = np.nan
+    pressure, force, covariance = (np.full(n, np.nan) for n in (len(bend_angles), 2, (2, 2)))
+    about = pressure, distance, unknown, unknown, force, covariance, ""
     return Touch(time, bend_angles, False, never, *about)
 
 

@@ -107,7 +107,9 @@ class Nominal:
             ),
         )
         self.reference = _held(plan.tip_reference)
-        known = self._known_disturbance(plan, response.tip[: len(plan.time)])
+        known = np.zeros_like(self.reference)
+        if plan.model == "der":  # what a learned plan expects beyond the model; its end stays
+            known = _held(plan.tip_predicted - response.tip[: len(plan.time)])
         tip, bend = response.tip[:-1] + known, response.bend_angles[:-1]
         bend = bend + self._bend_of(bend, known)
         self.bend, self.tip = bend, tip
@@ -174,12 +176,6 @@ class Nominal:
     def moved_tip(self, bend: Array, change: Array) -> Array:
         """Return by how much the tip moves (…, 2) [m] if bend angles (…, M) change [rad]."""
         return self.kinematics.tip(bend + change) - self.kinematics.tip(bend)
-
-    def _known_disturbance(self, plan: Plan, model_tip: Array) -> Array:
-        """Return what a learned plan expects beyond the model (K', 2) [m]; the last of it stays."""
-        if plan.model != "der":
-            return np.zeros_like(self.reference)
-        return _held(plan.tip_predicted - model_tip)
 
     def _bend_of(self, bend: Array, moved: Array) -> Array:
         """Return changes of bend (K', M) [rad] that move the tip by (K', 2) [m].

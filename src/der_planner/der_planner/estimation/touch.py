@@ -161,7 +161,7 @@ class TouchSense:
         if touched and not told:
             found = locate(self._model, away, self._places)
             said = found.said + (", or a payload" if weighed else "")
-            found = replace(found, since=since, distance=distance, weighed=weighed, said=said)
+            found = replace(found, since=since, distance=distance, said=said)
         else:
             said = f"{1000 * payload:.0f} g more at the tip than planned" if payload else ""
             found = replace(untouched(lacking.time, lacking.bend_angles, distance), said=said)
@@ -248,8 +248,6 @@ class TouchSense:
 
     def _weight_effect(self, bend_angles: Array) -> Array:
         """Return what the weight of a kilogram at the tip makes the model lack (M + 2,)."""
-        if not self._has_weight:
-            return np.zeros(self._model.inputs + 2)
         effect = effects(self._model, bend_angles, self._places[-1:])[0]
         weight: Array = effect @ np.array(self._model.limb.gravity[:2])
         return weight

@@ -172,7 +172,7 @@ def _after_no_step(command: Array, rate: float, rising: bool = False) -> NDArray
     ``rising`` counts only steps up.
     """
     change = np.diff(command, axis=0, prepend=command[:1])
-    jump = (change if rising else np.abs(change)) > rate * PERIOD
+    jump = ~((change if rising else np.abs(change)) <= rate * PERIOD)
     memory = np.ones(round(STEP_MEMORY / PERIOD))
     return np.asarray(lfilter(memory, [1.0], jump.astype(float), axis=0) < 0.5)
 

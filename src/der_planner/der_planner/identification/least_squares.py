@@ -106,9 +106,6 @@ class LeastSquares:
         """
         unknowns = self.unknowns
         begin = unknowns.inside(unknowns.prior if start is None else start)
-        if not self.follows(begin):
-            raise ValueError("a fit must begin where its model can be followed")
-
         rows = self._all_rows if self._cheap else self._summed
 
         def residual(x: Array) -> Array:

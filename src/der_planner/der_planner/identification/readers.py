@@ -242,7 +242,10 @@ def ask_map(names: Sequence[str], path: Path, ask: Callable[[str], str] = input)
                 break
         is_list = item.metadata["reading"] is _names
         is_column = is_list or key == "time"
-        found = [names[int(each)] if is_column and each.isdigit() else each for each in words]
+        found = [
+            names[int(each)] if is_column and each.isdigit() and int(each) < len(names) else each
+            for each in words
+        ]
         if found:
             content[key] = found if is_list else found[0]
     path.write_text(yaml.safe_dump(content, sort_keys=False))
@@ -257,13 +260,6 @@ def read_csv(path: str | Path, columns: ColumnMap) -> CalibrationLog:
     """
     pressures, seen = columns.commanded + columns.chambers, columns.angles + columns.tip
     table = read_table(Path(path), {columns.time, *pressures, *seen, *columns.tags})
-    count = len(columns.chambers) // 2 if columns.poses else len(columns.angles)
-    given = len(columns.commanded), len(columns.chambers)
-    if not set(given) <= {count, 2 * count}:
-        raise LogError(
-            f"the column map names {count} angles: it needs {count} differential pressures or "
-            f"{2 * count} chambers as commands and as chambers, got {given[0]} and {given[1]}"
-        )
 
     def pick(names: tuple[str, ...]) -> Array:
         missing = [name for name in names if name not in table]
@@ -275,10 +271,6 @@ def read_csv(path: str | Path, columns: ColumnMap) -> CalibrationLog:
 
     pressure = columns.factor("pressure_unit")
     time = columns.factor("time_unit") * pick((columns.time,))[:, 0]
-    command, measured = (
-        each if each.shape[1] == count else each[:, 0::2] - each[:, 1::2]
-        for each in (pressure * pick(columns.commanded), pressure * pick(columns.chambers))
-    )
     tip = np.full((len(time), 2), np.nan)
     if columns.poses:
         poses = read_poses(Path(columns.poses))
@@ -286,6 +278,16 @@ def read_csv(path: str | Path, columns: ColumnMap) -> CalibrationLog:
         angles, tip = bends_of(poses, Path(columns.bodies), time)
     else:
         angles = columns.factor("angle_unit") * columns.angle_factor * pick(columns.angles)
+    count, given = angles.shape[1], (len(columns.commanded), len(columns.chambers))
+    if not set(given) <= {count, 2 * count}:
+        raise LogError(
+            f"the log has {count} angles: its column map needs {count} differential pressures or "
+            f"{2 * count} chambers as commands and as chambers, got {given[0]} and {given[1]}"
+        )
+    command, measured = (
+        each if each.shape[1] == count else each[:, 0::2] - each[:, 1::2]
+        for each in (pressure * pick(columns.commanded), pressure * pick(columns.chambers))
+    )
     if columns.tip:
         tip = columns.factor("length_unit") * pick(columns.tip)
     if columns.rest_until != 0:

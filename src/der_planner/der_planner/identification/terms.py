@@ -144,10 +144,8 @@ def without(values: Array, groups: Collection[str]) -> Array:
     """Return the values (M, T) with the terms outside ``groups`` switched off."""
     result = values.copy()
     for index, term in enumerate(TERMS):
-        if term.group in groups or term.group == "linear":
-            continue
         keeps = term.kept or _DECLARED[_FIELDS[term.name]].needs
-        if term.relative or not keeps:
+        if not keeps and term.group not in ("linear", *groups):
             result[:, index] = 0.0
     return result
 

@@ -230,7 +230,6 @@ def _chamber_pressures(target: Array, start: Array, h: float, law: AirLaw) -> tu
     filling, half_filling = np.exp(-h / law.fill_lag), np.exp(-0.5 * h / law.fill_lag)
     for m in range(inputs):
         for side in range(2):
-            sign = 1.0 - 2.0 * side
             state = start[m, side]
             for k in range(count):
                 goal = target[k, m, side]
@@ -241,7 +240,7 @@ def _chamber_pressures(target: Array, start: Array, h: float, law: AirLaw) -> tu
                     between = fallen(state, goal, 0.5 * h, law)[0]
                     state = fallen(state, goal, h, law)[0]
                 pair[k, m, side] = state
-                middle[k, m] = between if side == 0 else middle[k, m] + sign * between
+                middle[k, m] = between if side == 0 else middle[k, m] - between
     return middle, pair
 
 

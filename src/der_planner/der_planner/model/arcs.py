@@ -198,8 +198,6 @@ class ArcModel(Model):
         drive = self.gain * self._check("pressures", effective)
         still = np.zeros(self.segment_count)
         q: Array = self.free_angles + drive / self.stiffness
-        if not self.arcs.gravity.any() and not self.cubic.any():
-            return ArcState(q, still)
         for _ in range(_RESTING_STEPS):
             pull = drive - kernels.needed_torque(q, still, still, self.arcs)
             values, vectors = np.linalg.eigh(self.stiffness_matrix(q))

@@ -8,7 +8,6 @@ edge; at the clamp: +x).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
@@ -89,8 +88,6 @@ class TipOfBend(Protocol):
 class Kinematics(TipOfBend, Protocol):
     """The whole shape of a limb for given bend angles."""
 
-    segment_count: int
-
     def curve(self, bend_angles: ArrayLike) -> Array:
         """Return the centreline (P, 2) of one configuration (M,)."""
 
@@ -102,26 +99,14 @@ class PolylineKinematics:
     turns at its n − 2 inner nodes, hence W_ej = clip((e − a) / (n − 2), 0, 1).
 
     Args:
-        rest_lengths: (N-1,) edges [m].
-        segments: (first node, node count) of each segment.
-        base: x of the first node [m], behind which the limb is straight and stiff.
+        rod: whose edges they are. Behind its first node, at x = ``base``, the limb is straight.
     """
 
-    def __init__(
-        self, rest_lengths: ArrayLike, segments: Sequence[tuple[int, int]], base: float = 0.0
-    ) -> None:
-        self.base = base
-        self.rest_lengths = np.asarray(rest_lengths, dtype=float)
-        self.segment_count = len(segments)
+    def __init__(self, rod: Rod) -> None:
+        self.base, self.rest_lengths = rod.mesh.base, rod.rest_lengths
         edges = np.arange(len(self.rest_lengths))[:, None]
-        first = np.array([first for first, _ in segments])
-        turns = np.array([count - 2 for _, count in segments])
-        self.turning = np.clip((edges - first) / turns, 0.0, 1.0)
-
-    @classmethod
-    def of_rod(cls, rod: Rod) -> PolylineKinematics:
-        """Return the kinematics of a rod's own edges."""
-        return cls(rod.rest_lengths, rod.segments, rod.mesh.base)
+        first, count = np.array(rod.segments).reshape(-1, 2).T
+        self.turning = np.clip((edges - first) / (count - 2), 0.0, 1.0)
 
     def _edges(self, bend_angles: ArrayLike) -> NDArray[np.complex128]:
         heading = np.asarray(bend_angles, dtype=float) @ self.turning.T

@@ -279,10 +279,7 @@ class Material:
             )
             for s in self._segments
         ]
-        gain, cubic, rest, friction, turn, creep, relaxation, stiffness = np.array(columns).T.copy()
-        return RestingLaw(
-            gain, cubic, rest, friction, turn, creep, relaxation, stiffness, weight_of(self._limb)
-        )
+        return RestingLaw._make([*np.array(columns).T.copy(), weight_of(self._limb)])
 
 
 def _coupling_matrix(limb: Limb) -> Array:

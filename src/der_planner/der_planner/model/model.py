@@ -91,12 +91,7 @@ class Model(ABC):
     """
 
     name: ClassVar[str]
-    kinds: ClassVar[dict[str, type[Model]]] = {}
     kinematics: Kinematics
-
-    def __init_subclass__(cls) -> None:
-        if "name" in vars(cls):
-            Model.kinds[cls.name] = cls
 
     def __init__(self, limb: Limb, nodes: int = NODES) -> None:
         self.limb, self.nodes = limb, nodes
@@ -116,7 +111,8 @@ class Model(ABC):
         Raises:
             LimbError: another model is asked for.
         """
-        return Model.kinds[name](limb.for_model(name), nodes)
+        own = limb.for_model(name)
+        return next(kind for kind in Model.__subclasses__() if kind.name == name)(own, nodes)
 
     def another(self: AnyModel, limb: Limb) -> AnyModel:
         """Return the same model of another limb."""

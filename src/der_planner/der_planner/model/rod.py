@@ -85,7 +85,7 @@ class RodModel(Model):
     def __init__(self, limb: Limb, nodes: int = NODES) -> None:
         super().__init__(limb, nodes)
         self.rod = Rod.from_limb(limb, nodes)
-        self.kinematics = PolylineKinematics.of_rod(self.rod)
+        self.kinematics = PolylineKinematics(self.rod)
 
     @cached_property
     def balance(self) -> Balance:
@@ -102,8 +102,7 @@ class RodModel(Model):
 
     def bend_of(self, state: RodState) -> Array:
         """Return the bend angles (M,) [rad] of a state."""
-        angles: Array = bend_angles(self.rod, state.q[None])[0]
-        return angles
+        return bend_angles(self.rod, state.q)
 
     def state(self, angles: ArrayLike, rates: ArrayLike) -> RodState:
         """Return the rod evenly bent, at bend angles and rates (M,) [rad], [rad/s]."""
@@ -160,8 +159,10 @@ class Balance:
         pressures: Array = load / self._moment_gain
         return pressures
 
-    def paper(self, q: Array, v: Array, a: Array) -> Array:
+    def paper(self, q: Array, v: Array, a: Array) -> tuple[Array, Array]:
         """Return (K, M) pressures [Pa] from (B Λ)† (M q̈ + D q̇ − F_int − F_ext) on the free rows.
+
+        Also (B Λ)† (K, M, 2(N−1)) [Pa/N] on the free rows, those of nodes 1 … N−1.
 
         Args:
             q: (K, M) bend angles of evenly bent segments [rad].
@@ -169,12 +170,8 @@ class Balance:
             a: their accelerations [rad/s²].
         """
         force = self._needed_force(q, v, a)[:, 1:].reshape(len(q), -1)
-        pressures: Array = np.einsum("kmf,kf->km", self.inverse_inputs(q), force)
-        return pressures
-
-    def inverse_inputs(self, q: Array) -> Array:
-        """Return (B Λ)† (K, M, 2(N−1)) [Pa/N] on the free rows of nodes 1 … N−1."""
-        return np.asarray(np.linalg.pinv(self._input_matrix(q)), dtype=np.float64)
+        inverse = np.asarray(np.linalg.pinv(self._input_matrix(q)), dtype=np.float64)
+        return np.einsum("kmf,kf->km", inverse, force), inverse
 
     def _needed_force(self, q: Array, v: Array, a: Array) -> Array:
         """Return M q̈ + D q̇ − F_int − F_ext (K, N, 2) of evenly bent configurations [N].

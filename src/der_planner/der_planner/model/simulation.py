@@ -281,26 +281,24 @@ def means_between(pressure: Array, steps: int) -> Array:
 
 @dataclass(frozen=True)
 class Window:
-    """Effective pressures under W commands in a row, the first of which has the index `first`.
+    """Effective pressures under W commands in a row.
 
     Attributes:
         material: of the limb.
-        first: index of the first command of the window.
-        chambers: what the chambers do under the commands from index ``begin`` on.
-        begin: index of the first command that the chambers were given.
+        chambers: what the chambers do under these and the commands before them.
+        before: how many come before.
         effective: (W, S, M) effective pressure of each integrator step [Pa].
     """
 
     material: Material
-    first: int
     chambers: Chambers
-    begin: int
+    before: int
     effective: Array
 
     @property
     def differential(self) -> Array:
         """(W, S, M) pressure in the chambers amid each integrator step [Pa]."""
-        return self.chambers.differential[self.first - self.begin :]
+        return self.chambers.differential[self.before :]
 
     @cached_property
     def slopes(self) -> Array:
@@ -309,7 +307,7 @@ class Window:
 
     def by_command(self) -> Array:
         """Return ∂(differential pressure of a step)/∂command (W, S, W, M) within the window."""
-        return self.chambers.derivative(self.first - self.begin)
+        return self.chambers.derivative(self.before)
 
 
 class Drive:
@@ -355,4 +353,4 @@ class Drive:
         chambers = self._air.follow(command[begin:], self.period, self.steps, before)
         differential = chambers.differential[first - begin :]
         effective = self._material.without_memory(differential, self._taken[first : len(command)])
-        return Window(self._material, first, chambers, begin, effective)
+        return Window(self._material, chambers, first - begin, effective)

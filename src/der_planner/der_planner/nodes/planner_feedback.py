@@ -92,10 +92,10 @@ class _Corrected:
             told: in the order in which it came.
             alone: that schedule is corrected no more.
         """
-        receiver: _Corrected | None = self
-        if self._left is not None:
-            receiver = self._left if alone else None
-        for item in told if receiver is not None else ():
+        if self._left is not None and not alone:
+            return  # that schedule is told itself
+        receiver = self._left or self
+        for item in told:
             item(receiver)
 
     def pressures(self, index: int) -> Array:
@@ -165,17 +165,16 @@ class Corrector:
     def forget(self, schedule: Schedule) -> str:
         """Correct a schedule no more; return why feedback had the limb vented, if it had."""
         with self._wake:
-            ended = [each for each in self._open if each.schedule is schedule]
-            self._open = [each for each in self._open if each.schedule is not schedule]
-        for each in ended:
-            touch = each.feedback.touch
-            if each.touching:
-                over = untouched(touch.time, touch.bend_angles)
-                said = "the motion has ended: touch is felt in motions with feedback alone"
-                self._output.contact(schedule, replace(over, said=said))
-            if each.vented:
-                return f"{TOUCHED} (the reaction is to vent): {touch.said}"
-        return ""
+            ended = next((each for each in self._open if each.schedule is schedule), None)
+            if ended is None:
+                return ""
+            self._open.remove(ended)
+        touch = ended.feedback.touch
+        if ended.touching:
+            over = untouched(touch.time, touch.bend_angles)
+            said = "the motion has ended: touch is felt in motions with feedback alone"
+            self._output.contact(schedule, replace(over, said=said))
+        return f"{TOUCHED} (the reaction is to vent): {touch.said}" if ended.vented else ""
 
     def pressures(self, schedule: Schedule, index: int) -> Array:
         """Return the pressures (M,) [Pa] with which a setpoint is first sent."""
@@ -334,5 +333,6 @@ def warm_up(limb: Limb, nodes: int) -> None:
     for model, methods in METHODS.items():
         for method in methods:
             found = plan(limb, quick, model, method, nodes=nodes)
-    # The last of them has compiled whatever feedback calls as well.
-    Feedback(found)
+    feedback = Feedback(found)
+    feedback.measure(0.0, found.bend_angles[0], found.tip_predicted[0])
+    feedback.command(0.0)

@@ -359,11 +359,11 @@ class MotionAction:
         with self._lock:
             goals = list(self._goals.items())
         for plan_id, goal in goals:
-            schedule = self._schedule(plan_id)
-            at = math.nan if schedule is None else (stamp - schedule.start) / GRID
-            if schedule is not None and 0 <= at <= schedule.count - 1:
-                rows, tips = np.arange(schedule.count), schedule.plan.tip_reference.T
-                x, y = (np.interp(at, rows, tip) for tip in tips)
+            if (schedule := self._schedule(plan_id)) is None:
+                continue
+            at, rows = (stamp - schedule.start) / GRID, np.arange(schedule.count)
+            if 0 <= at <= rows[-1]:
+                x, y = (np.interp(at, rows, tip) for tip in schedule.plan.tip_reference.T)
                 goal.errors.append(math.hypot(state.tip.x - x, state.tip.y - y))
 
     def tell(self, plan_id: str, state: str, progress: float) -> None:

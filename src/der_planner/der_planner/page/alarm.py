@@ -31,6 +31,11 @@ NODES = {
 """Nodes of a limb, worst first, with what their end means."""
 DRIVER = "pressure_driver"
 TRACKERS = ("apriltag_tracker", "pose_tracker")
+PACKAGES = {
+    **dict.fromkeys((DRIVER, "board_emulator"), "pressure_driver"),
+    **dict.fromkeys((*TRACKERS, "synthetic_camera", "synthetic_poses"), "apriltag_tracker"),
+}
+"""Packages of the nodes that are not of der_planner."""
 WANTED = (DRIVER, "planner", TRACKERS[0], "recorder")
 """Without these a limb is not played, seen and recorded."""
 ORDER = ("dead", "error", "late", "warning", "stale", "ok", "ended")
@@ -114,10 +119,10 @@ def _between_runs(own: dict[str, dict[str, Any]]) -> bool:
 
 def _of_driver(snapshot: dict[str, Any], node: dict[str, Any] | None) -> Iterator[Alarm]:
     source, driver = snapshot["sources"]["driver"], snapshot["driver"]
-    dead = node is not None and node["state"] == "dead"
+    dead = f"The driver is dead: {_reason(node)}" if node and node["state"] == "dead" else ""
     if driver is None:
-        if node is not None and dead:
-            yield Alarm("danger", f"The driver is dead: {_reason(node)}", None, _restart(node))
+        if dead:
+            yield Alarm("danger", dead, None, _restart(node))
         elif node is None:
             yield Alarm("notice", "No driver is heard", None, "start it: " + start_of(DRIVER, None))
         return
@@ -125,10 +130,12 @@ def _of_driver(snapshot: dict[str, Any], node: dict[str, Any] | None) -> Iterato
         told = "The driver has been ended in order, and has vented the limb"
         yield Alarm("notice", told, None, "start it again: " + start_of(DRIVER, node))
         return
-    if dead or source["age"] > LATE:
-        yield Alarm("danger", *_silence(source, driver, node))
-        return
     limb = describe_limb(driver)
+    if dead or source["age"] > LATE:
+        told = f"{dead or 'The driver says nothing'}. When last heard, the limb was {limb}"
+        told += f", in mode {driver['mode']}"
+        yield Alarm("danger", told, source["age"], _restart(node))
+        return
     if driver["mode"] == "fault":
         faults = "; ".join(driver["faults"]) or "no reason given"
         advice = "remove the cause, then arm"
@@ -143,17 +150,6 @@ def _of_driver(snapshot: dict[str, Any], node: dict[str, Any] | None) -> Iterato
         yield Alarm("notice", told, None, "arm to go on")
 
 
-def _silence(
-    source: dict[str, Any], driver: dict[str, Any], node: dict[str, Any] | None
-) -> tuple[str, float, str]:
-    """Return text, time and advice for a driver that was heard and is not heard any more."""
-    told = "The driver says nothing"
-    if node is not None and node["state"] == "dead":
-        told = f"The driver is dead: {_reason(node)}"
-    limb = f"When last heard, the limb was {describe_limb(driver)}, in mode {driver['mode']}"
-    return f"{told}. {limb}", source["age"], _restart(node)
-
-
 def _restart(node: dict[str, Any] | None) -> str:
     return f"{SUPPLY}; then start the driver again: {start_of(DRIVER, node)}"
 
@@ -166,9 +162,7 @@ def _reason(node: dict[str, Any]) -> str:
 def start_of(name: str, node: dict[str, Any] | None) -> str:
     """Return the command that starts a node: as it was started, where that is known."""
     known = "" if node is None else node["command"]
-    package = "apriltag_tracker" if name in TRACKERS else "der_planner"
-    package = DRIVER if name == DRIVER else package
-    return known or f"scripts/ros2 run {package} {name}"
+    return known or f"scripts/ros2 run {PACKAGES.get(name, 'der_planner')} {name}"
 
 
 def _of_touch(snapshot: dict[str, Any], planner: dict[str, Any] | None) -> Iterator[Alarm]:

@@ -59,13 +59,11 @@ class Commands:
     Args:
         node: of the page.
         situation: what the nodes have said of themselves.
-        segments: of the limb.
     """
 
-    def __init__(self, node: Node, situation: Situation, segments: int) -> None:
+    def __init__(self, node: Node, situation: Situation) -> None:
         self._node = node
         self._situation = situation
-        self._segments = segments
         self._service_clients = {
             service: node.create_client(Trigger, path) for service, path in SERVICES.items()
         }
@@ -120,20 +118,21 @@ class Commands:
             return Answer(True, f"the planner plans {what} with {command.model}")
         return Answer(False, f"the planner has not answered within {PATIENCE:.0f} s")
 
-    def fill(self, segment: int, side: int, pressure: float) -> Answer:
+    def fill(self, segment: int, side: int, pressure: float, segments: int) -> Answer:
         """Fill one chamber alone for `FILLING`, if the driver is armed and nothing is played.
 
         Args:
             segment: its number, 0 at the clamp.
             side: 1 for the left chamber, which bends counter-clockwise, -1 for the right one.
             pressure: differential pressure [Pa], above zero.
+            segments: of the limb.
         """
         mode = self._situation.driver_mode
         if mode != "armed":
             text = f"the driver is {mode or 'not heard'}: it must be armed and at rest"
             return Answer(False, text)
         first = (time.time_ns() // TICK + TICKS_AHEAD) * TICK
-        plan_id, values = f"fill_{uuid.uuid4().hex[:8]}", [0.0] * self._segments
+        plan_id, values = f"fill_{uuid.uuid4().hex[:8]}", [0.0] * segments
         values[segment] = side * pressure
         for index in range(round(FILLING * NANOSECONDS / TICK)):
             message = PressureSetpoint(plan_id=plan_id, index=index, differential_pressure=values)

@@ -88,7 +88,7 @@ class PageNode(Node):
             picture=PictureFeed(rate),
             overlay=Overlay(TagMap.from_yaml(tag_map)),
             desk=Desk(),
-            commands=Commands(self, self._situation, previewer.limb.segment_count),
+            commands=Commands(self, self._situation),
             previewer=previewer,
             drawings=DrawingFolder(Path(drawings).expanduser()),
             report=Path(report).absolute() if report else None,

@@ -6,7 +6,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import Any, TypeVar
 
 import cv2
@@ -149,7 +149,7 @@ class Overlay:
         """Take the camera's calibration; the pose is found anew if it changed."""
         with self._lock:
             old = self._intrinsics
-            if old is None or not np.array_equal(old.matrix, intrinsics.matrix):
+            if old is None or not all(map(np.array_equal, astuple(old), astuple(intrinsics))):
                 self._intrinsics = intrinsics
                 self._world = WorldPose(self._tags, intrinsics)
 

@@ -72,9 +72,11 @@ class SetupGuide:
         sources = data["sources"]
         driver = data["driver"] if sources["driver"]["fresh"] else None
         limb = data["limb"] if sources["tracker"]["fresh"] else None
-        planned, identified = _planned_limb(data["nodes"])
+        gone = ("late", "dead", "ended")
+        alive = {node["own"]: node["values"] for node in data["nodes"] if node["state"] not in gone}
+        planner, mocap = alive.get("planner", {}), "pose_tracker" in alive
+        planned, identified = planner.get("limb", ""), planner.get("limb_identified", "")
         told = f"identified on {identified}" if identified else "which nobody identified"
-        mocap = _heard(data["nodes"], "pose_tracker") is not None
         self._watch(driver)
         return [
             _board(driver),
@@ -202,27 +204,6 @@ def _camera(live: bool, calibrated: bool, mocap: bool) -> Step:
     )
 
 
-def _heard(nodes: Sequence[dict[str, Any]], name: str) -> dict[str, Any] | None:
-    """Return a node that is alive, None if there is none of the name."""
-    return next(
-        (
-            node
-            for node in nodes
-            if node["own"] == name and node["state"] not in ("late", "dead", "ended")
-        ),
-        None,
-    )
-
-
-def _planned_limb(nodes: Sequence[dict[str, Any]]) -> tuple[str, str]:
-    """Return the limb that the planner plans for, and when and on what it was identified."""
-    planner = _heard(nodes, "planner")
-    if planner is None:
-        return "", ""
-    values = planner["values"]
-    return str(values.get("limb", "")), str(values.get("limb_identified", ""))
-
-
 def show_answer(client: Client, answer: Answer) -> None:
     """Show in a window what came of a request."""
     with client:
@@ -274,7 +255,7 @@ def add_setup_guide(parts: Parts) -> None:
 
 def _add_buttons(client: Client, parts: Parts) -> None:
     """Add the buttons that arm and fill one chamber; each commands only as long as it acts."""
-    limit = parts.previewer.limb.pneumatics.pressure_limit
+    limb = parts.previewer.limb
 
     def may_command() -> bool:
         if parts.desk.take(client.id):
@@ -292,8 +273,9 @@ def _add_buttons(client: Client, parts: Parts) -> None:
     async def fill(segment: int, side: int) -> None:
         if may_command():
             try:
-                pressure = min(FILLED * parts.situation.limit, limit)
-                show_answer(client, parts.commands.fill(segment, side, pressure))
+                pressure = min(FILLED * parts.situation.limit, limb.pneumatics.pressure_limit)
+                answer = parts.commands.fill(segment, side, pressure, limb.segment_count)
+                show_answer(client, answer)
                 await asyncio.sleep(FILLING)
             finally:
                 parts.desk.leave(client.id)
@@ -301,7 +283,7 @@ def _add_buttons(client: Client, parts: Parts) -> None:
     ui.label(f"One chamber alone, for {FILLING:.0f} s:")
     with ui.row().classes("line"):
         ui.button("Arm", on_click=arm, color="positive").props('id="arm"')
-        for segment in range(parts.previewer.limb.segment_count):
+        for segment in range(limb.segment_count):
             for side in (1, -1):
                 press = functools.partial(fill, segment, side)
                 name = f"fill-{segment}-{'left' if side > 0 else 'right'}"

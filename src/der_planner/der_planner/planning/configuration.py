@@ -225,7 +225,7 @@ class RodConfiguration(Configuration):
         # (B Λ)† (M q̄̈ + D q̄̇ − F_int − F_ext)
         placed, moving, _ = self.model.kinematics.motion(q, v, a)
         position, velocity = coordinates(placed), coordinates(moving)
-        inverse, pressures = balance.inverse_inputs(q), balance.paper(q, v, a)
+        pressures, inverse = balance.paper(q, v, a)
         return self._beside_the_model(pressures, inverse, position, velocity, time)
 
     def _beside_the_model(

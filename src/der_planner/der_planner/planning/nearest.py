@@ -196,11 +196,7 @@ def _second_differences(count: int) -> sparse.csr_array:
 
 def _banded(matrix: sparse.csr_array, rows: int) -> Array:
     """Return the lower band (rows, n) of a symmetric matrix, as `solveh_banded` takes it."""
-    diagonals, band = matrix.todia(), np.zeros((rows, matrix.shape[0]))
-    for offset, values in zip(diagonals.offsets, diagonals.data, strict=True):
-        if offset <= 0:
-            band[-offset, : len(values)] = values
-    return band
+    return np.stack([np.pad(matrix.diagonal(-k), (0, k)) for k in range(rows)])
 
 
 class _Search:

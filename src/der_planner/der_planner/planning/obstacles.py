@@ -78,10 +78,6 @@ class Obstacle:
         distance = np.linalg.norm(between, axis=-1)
         return distance - self.radius, between / np.maximum(distance, 1e-12)[..., None]
 
-    def __str__(self) -> str:
-        """Return its name."""
-        return self.name
-
 
 @dataclass(eq=False)
 class ObstacleError(PlanningError):
@@ -110,8 +106,8 @@ class ObstacleError(PlanningError):
         )
         return (
             f"at t = {self.time:.2f} s the limb would run {-self.clearance * 1000:.1f} mm into "
-            f"{self.obstacle}, {self.place * 100:.1f} cm from its clamp, {with_force}: shrink or "
-            "move the motion"
+            f"{self.obstacle.name}, {self.place * 100:.1f} cm from its clamp, {with_force}: shrink "
+            "or move the motion"
         )
 
 
@@ -211,21 +207,22 @@ class Obstacles:
         for each in self.items:
             if each.allowed_force > _OTHER_UNIT * force:
                 raise PlanningError(
-                    f"{each} may be touched with {each.allowed_force:g} N, and the tip presses "
-                    f"with some {force:.2g} N at most: give N"
+                    f"{each.name} may be touched with {each.allowed_force:g} N, and the tip "
+                    f"presses with some {force:.2g} N at most: give N"
                 )
             if abs(each.away(np.zeros(2))[0]) > _OTHER_UNIT * length:
                 raise PlanningError(
-                    f"{each} in the file of obstacles is far too large for a limb of {length:.3g} "
-                    "m: give all lengths in metres"
+                    f"{each.name} in the file of obstacles is far too large for a limb of "
+                    f"{length:.3g} m: give all lengths in metres"
                 )
         try:
             self.check(model, np.zeros(1), curve[None], bend[None])
         except ObstacleError as error:
             raise PlanningError(
-                f"the resting limb is {-error.clearance * 1000:.1f} mm inside {error.obstacle}, "
-                f"{error.place * 100:.1f} cm from its clamp: give its place in metres from the "
-                "clamp, limb_radius_m as it is, and a normal that points to the limb's side"
+                f"the resting limb is {-error.clearance * 1000:.1f} mm inside "
+                f"{error.obstacle.name}, {error.place * 100:.1f} cm from its clamp: give its "
+                "place in metres from the clamp, limb_radius_m as it is, and a normal that points "
+                "to the limb's side"
             ) from error
 
     def check(self, model: RodModel, time: Array, curves: Array, bend_angles: Array) -> str:
@@ -252,7 +249,7 @@ class Obstacles:
             if force > obstacle.allowed_force:
                 instant = float(time[found.index])
                 raise ObstacleError(instant, found.place, found.clearance, force, obstacle)
-            touched.append(f"{obstacle} with up to {force:.2f} N")
+            touched.append(f"{obstacle.name} with up to {force:.2f} N")
         if not touched:
             return ""
         return f"the limb touches {', '.join(touched)}; the tip is predicted as if nothing held it"

@@ -177,7 +177,7 @@ def draw_shape(
     """
     bend = from_bend + 1.2 * amplitude
     centre = kinematics.tip(bend)
-    length = float(kinematics.tip(np.zeros(kinematics.segment_count))[0])
+    length = float(kinematics.tip(np.zeros_like(bend))[0])
     radius = SHAPE_SIZE * length * amplitude / (np.pi / 4)
     heading = float(bend.sum()) / 2
     along = np.array([np.cos(heading), np.sin(heading)])

@@ -213,7 +213,7 @@ def plot_pressures(runs: Sequence[RunSeries], folder: Path) -> list[Path]:
     if not runs:
         return []
     motions = by_motion(runs)
-    segments = runs[0].commanded.value.shape[1]
+    segments = max(run.commanded.value.shape[1] for run in runs)
     with paper_style():
         figure = Figure(figsize=(PAGE, 1.9 * len(motions)))
         axes = figure.subplots(len(motions), segments, squeeze=False, sharex="row")
@@ -234,8 +234,8 @@ def _draw_pressures(row: Sequence[Axes], run: RunSeries, look: tuple[float, ...]
     )
     for name, drawn in kinds:
         stream = getattr(run, name).between(0.0, run.reference.time[-1])
-        for segment, axis in enumerate(row if len(stream) else ()):
-            axis.plot(stream.time, stream.value[:, segment] / 1000.0, color=look, **drawn)
+        for axis, pressure in zip(row, stream.value.T if len(stream) else (), strict=False):
+            axis.plot(stream.time, pressure / 1000.0, color=look, **drawn)
 
 
 def plot_learning(results: Sequence[RunResult], folder: Path) -> list[Path]:

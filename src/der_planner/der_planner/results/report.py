@@ -147,18 +147,25 @@ def _sections(results: Sequence[RunResult], figures: Sequence[str]) -> list[str]
 
 def side_by_side_table(results: Sequence[RunResult]) -> Table:
     """Return the table of `side_by_side` in cm; without rows where nothing stands beside."""
+    rows = side_by_side(results)
 
     def show(key: str) -> Callable[[dict[str, Any]], str]:
         return lambda row: number(row[key], CM, 3)
 
-    columns: dict[str, Callable[[dict[str, Any]], str]] = {
+    columns: dict[str, Callable[[dict[str, Any]], str]] = {}
+    if several_limbs(row["namespace"] for row in rows):
+        columns["limb"] = lambda row: row["namespace"]
+    if any(row["loads"] for row in rows):
+        columns["loads"] = lambda row: row["loads"] or "horizontal"
+    columns |= {
         "case": lambda row: CASE.get(row["motion"], row["motion"]),
         "model": lambda row: row["model"].upper(),
     }
+    names = len(columns)
     for name in CONTROLS:
         head = name.replace("open_loop", "open loop").replace("_", " + ")
         columns[f"{head}, E [cm]"] = show(f"{name}_m")
-    return Table.of(side_by_side(results), columns, names=2)
+    return Table.of(rows, columns, names)
 
 
 Columns = dict[str, Callable[[RunResult], str]]

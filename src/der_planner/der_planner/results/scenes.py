@@ -104,7 +104,7 @@ class RunImages:
         """Return by how much pictures are stamped later than their states, which are right [ns]."""
         last = self._origin + round(DELAYED * NANOSECONDS)
         images, states = (
-            [header_stamp(message) for _, _, message in self._bag.messages(topics, None, last)]
+            [header_stamp(each) for _, _, each in self._bag.messages(topics, self._origin, last)]
             for topics in (self._topics[IMAGE_TYPE], self._topics[STATE_TYPE])
         )
         # The tracker takes the same time off every stamp.

@@ -242,11 +242,13 @@ def learning_curves(results: Sequence[RunResult]) -> dict[str, list[tuple[str, l
 
     Trials that were not learned from are left out.
     """
-    trials: dict[tuple[str, str, int, str], dict[int, float]] = {}
-    for result in results:
-        # "learned 2 + feedback": what was played beside the plan makes a curve of its own.
-        key = (result.motion, result.model, result.trial, result.method.partition("+")[2])
-        trials.setdefault(key, {})[learned_from(result.method)] = result.mean_error_m
+    trials: dict[tuple[Any, ...], dict[int, float]] = {}
+    for (namespace, loads, motion, model, method), runs in group(results).items():
+        for run in runs:
+            # "learned 2 + feedback": what was played beside the plan makes a curve of its own.
+            beside = method.partition("+")[2]
+            key = (motion, model, namespace, loads, run.trial, run.seed, beside)
+            trials.setdefault(key, {})[learned_from(method)] = run.mean_error_m
     curves: dict[str, list[tuple[str, list[float]]]] = {}
     for (motion, model, *_), errors in trials.items():
         if max(errors) > 0 and 0 in errors:
@@ -256,31 +258,26 @@ def learning_curves(results: Sequence[RunResult]) -> dict[str, list[tuple[str, l
 
 def control_of(method: str) -> str:
     """Return which of `CONTROLS` a run's method belongs to."""
-    learned = "learned" if learned_from(method) else ""
     corrected = method.partition("+")[2].strip() == FEEDBACK
-    return "_".join([learned] * bool(learned) + [FEEDBACK] * corrected) or "open_loop"
+    return CONTROLS[2 * (learned_from(method) > 0) + corrected]
 
 
 def side_by_side(results: Sequence[RunResult]) -> list[dict[str, Any]]:
-    """Return by limb, motion and model the mean error [m] of each of `CONTROLS`; None: not played.
+    """Return by limb, loads, motion and model the mean error [m] of each of `CONTROLS`.
 
-    Of learned runs those count whose plan was learned from the most runs.
+    Of learned runs those count whose plan was learned from the most runs; None: not played.
     """
-    rows: dict[tuple[str, str, str], dict[str, dict[int, list[float]]]] = {}
-    for run in results:
-        row = rows.setdefault((run.namespace, run.motion, run.model), {})
-        by_count = row.setdefault(control_of(run.method), {})
-        by_count.setdefault(learned_from(run.method), []).append(run.mean_error_m)
+    rows: dict[tuple[str, ...], dict[str, dict[int, list[float]]]] = {}
+    for (*which, method), runs in group(results).items():
+        by_count = rows.setdefault(tuple(which), {}).setdefault(control_of(method), {})
+        by_count.setdefault(learned_from(method), []).extend(run.mean_error_m for run in runs)
+    names = ("namespace", "loads", "motion", "model")
     return [
-        {
-            "namespace": namespace,
-            "motion": motion,
-            "model": model,
-            **{
-                f"{name}_m": float(np.mean(row[name][max(row[name])])) if name in row else None
-                for name in CONTROLS
-            },
+        dict(zip(names, which, strict=True))
+        | {
+            f"{name}_m": float(np.mean(row[name][max(row[name])])) if name in row else None
+            for name in CONTROLS
         }
-        for (namespace, motion, model), row in rows.items()
+        for which, row in rows.items()
         if len(row) > 1
     ]

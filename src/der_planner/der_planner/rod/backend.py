@@ -168,6 +168,7 @@ class Backend(ABC):
         }
         return of_nodes | {
             "rest": np.concatenate([mesh.rest[:ghost], mesh.rest]),
+            "shortest": float(mesh.rest.min()),
             "axial": self.ghosted(mesh.axial),
             "first": first + ghost,
             "last": first + ghost + count - 2,

@@ -70,15 +70,6 @@ def put(source: Array, target: Array) -> None:
 
 
 @kernel
-def smallest(values: Array) -> float:
-    """Return the least of the values."""
-    result = np.inf
-    for value in values:
-        result = min(result, value)
-    return result
-
-
-@kernel
 def hold_fixed(s: Array, r: Array, fixed: Array) -> None:
     """Replace the equations of fixed unknowns in s, r by "no change"."""
     b = s.shape[1] - 1

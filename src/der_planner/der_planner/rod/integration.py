@@ -100,9 +100,10 @@ class Linearisation:
         else:
             rows = np.shape(pulse)[0] if np.ndim(pulse) else 0
             shape = array(pulse, (rows, self.input_count), "pulse")
-        out = np.zeros((self.intervals + 1, len(self.outputs), self.intervals, self.input_count))
-        step_kernel.sensitivity(shape, self.intervals, self.steps, 16, self.chain, out)
-        return out
+        count = self.intervals
+        out = np.zeros((count + 1, len(self.outputs), count * self.input_count))
+        step_kernel.sensitivity(shape, count, self.steps, 16, self.chain, out)
+        return out.reshape(*out.shape[:2], count, self.input_count)
 
 
 @dataclass(frozen=True)

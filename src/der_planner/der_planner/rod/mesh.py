@@ -197,14 +197,6 @@ def masses_on_nodes(masses: Sequence[tuple[float, float]], rest: Array) -> Array
     return result
 
 
-def voronoi_lengths(rest: Array, ghost: bool) -> Array:
-    """Return the (N,) Voronoi lengths of the nodes that bend, 0 for those that do not."""
-    cells = np.zeros(len(rest) + 1)
-    cells[1:-1] = 0.5 * (rest[:-1] + rest[1:])
-    cells[0] = 0.5 * rest[0] if ghost else 0.0
-    return cells
-
-
 def limb_mesh(limb: Limb, nodes: int) -> Mesh:
     """Return the mesh of `Rod.from_limb`; see there for the arguments."""
     least = 3 * limb.segment_count

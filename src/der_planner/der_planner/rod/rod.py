@@ -33,7 +33,6 @@ from der_planner.rod.mesh import (
     not_negative,
     positive,
     require,
-    voronoi_lengths,
 )
 
 Plane = Literal["xy", "xz"]
@@ -131,7 +130,8 @@ class Rod:
         pairs = check_segments(segments, nodes)
         gain = array(moment_gain, (len(pairs),), "moment_gain")
         ghost = clamp == "ghost"
-        cell = voronoi_lengths(np.full(nodes - 1, step), ghost)
+        cell = np.full(nodes, step)  # Voronoi lengths of the nodes that bend
+        cell[[0, -1]] = 0.5 * step if ghost else 0.0, 0.0
         inverse = np.divide(1.0, cell, out=np.zeros(nodes), where=cell > 0)
         curvature = array(rest_curvature, (2,), "rest_curvature")
         edge_mass = np.full(nodes - 1, mass_per_length * step)

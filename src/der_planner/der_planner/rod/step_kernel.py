@@ -248,9 +248,8 @@ def sensitivity(
     intervals are propagated together, so that their columns stay in the nearest cache and fill the
     vector unit.
     """
-    inputs, outputs = chain.record.inputs, chain.outputs
-    count = inputs.shape[2]
-    size = inputs.shape[1]
+    inputs = chain.record.inputs
+    _, size, count = inputs.shape
     solves = chain.steps.shape[0]
     for begin in range(0, intervals, chunk):
         end = min(intervals, begin + chunk)
@@ -271,6 +270,4 @@ def sensitivity(
                             y[i, (j - begin) * count + m] = inputs[s, i, m] * size_of_pulse
             advance(s, dq, dv, y, before, chain)
             if ends_interval(s, steps, chain):
-                for p in range(outputs.shape[0]):
-                    for c in range(columns):
-                        out[k + 1, p, begin + c // count, c % count] = dq[outputs[p], c]
+                put_outputs(dq, chain.outputs, out[k + 1, :, begin * count : end * count])

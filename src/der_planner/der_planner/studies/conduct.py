@@ -205,6 +205,19 @@ def _words(error: BaseException) -> str:
 # The cluster -----------------------------------------------------------------------------------
 
 
+def local_cluster(workers: int) -> LocalCluster:
+    """Return so many processes of this machine, with one thread each."""
+    return LocalCluster(
+        n_workers=workers,
+        threads_per_worker=1,
+        processes=True,
+        host="127.0.0.1",
+        dashboard_address="127.0.0.1:0",
+        memory_limit=0,
+        silence_logs=logging.CRITICAL,
+    )
+
+
 @contextlib.contextmanager
 def _cluster(settings: PlaySettings) -> Iterator[Client]:
     """Join a cluster, or start processes with one thread each on this machine.
@@ -217,17 +230,8 @@ def _cluster(settings: PlaySettings) -> Iterator[Client]:
         try:
             where: Any = settings.scheduler
             if not where:
-                where = stack.enter_context(
-                    LocalCluster(
-                        n_workers=settings.workers or len(os.sched_getaffinity(0)),
-                        threads_per_worker=1,
-                        processes=True,
-                        host="127.0.0.1",
-                        dashboard_address="127.0.0.1:0",
-                        memory_limit=0,
-                        silence_logs=logging.CRITICAL,
-                    )
-                )
+                count = settings.workers or len(os.sched_getaffinity(0))
+                where = stack.enter_context(local_cluster(count))
             client = Client(where, timeout=PATIENCE, set_as_default=False)
         except (OSError, TimeoutError, RuntimeError, ValueError) as error:
             raise StudyError(
@@ -303,10 +307,8 @@ class _Conductor:
         if twin is not None:
             # One task, however many rows wait for it.
             if twin not in self._twins:
-                key = "-".join(map(str, ("calibrate", *twin)))
-                self._twins[twin] = client.submit(
-                    calibrated, twin, self._study.limb, key=key, priority=-place
-                )
+                told = twin, self._study.limb
+                self._twins[twin] = client.submit(calibrated, *told, priority=-place)
             limb = self._twins[twin]
         task, key = self._study.task.name, f"row-{row.key}"
         future = client.submit(compute, task, dict(row.values), limb, key=key, priority=-place)

@@ -98,12 +98,8 @@ def saltelli(dimensions: int, count: int, seed: int) -> Array:
     """
     both = _sobol(2 * dimensions, count, seed)
     a, b = both[:, :dimensions], both[:, dimensions:]
-    mixed = []
-    for column in range(dimensions):
-        table = a.copy()
-        table[:, column] = b[:, column]
-        mixed.append(table)
-    return np.concatenate([a, b, *mixed])
+    columns = np.arange(dimensions)
+    return np.concatenate([a, b, *(np.where(columns == each, b, a) for each in columns)])
 
 
 def rows(

@@ -34,6 +34,7 @@ from der_planner.studies.factors import (
     IDENTIFICATION,
     MODEL,
     RUN,
+    StudyError,
     Value,
     split_error,
     with_defaults,
@@ -48,8 +49,10 @@ _FIRST_LEARNING_RUN = 10
 """Runs of a twin's hardware from here on are learned from; the one that counts is run 0."""
 _UNSEEN_RUN = 2
 """The run of a twin's hardware on which an identified limb is tried."""
-_PARTS = ("limb", "rod", "model", "identification", "twin", "planning", "control")
+_PARTS = ("limb", "rod", "model", "estimation", "identification", "twin", "planning", "control")
 """Parts of der_planner on which a row and a calibrated twin depend."""
+_BESIDE = ("arrays.py", "data/default_limb.yaml", "studies/factors.py", "studies/tasks.py")
+"""Files of der_planner beside those parts, of the same."""
 _LIBRARIES = ("numpy", "scipy", "numba", "pyelastica", "piqp")
 
 
@@ -122,7 +125,8 @@ def digest() -> str:
     found = hashlib.sha256(" ".join(f"{name} {version(name)}" for name in _LIBRARIES).encode())
     root = Path(next(iter(der_planner.__path__)))
     files = [file for part in _PARTS for file in sorted((root / part).rglob("*.py"))]
-    for file in [*files, Path(__file__), Path(str(pneumatics.__file__))]:
+    files += [root / name for name in _BESIDE] + [Path(str(pneumatics.__file__))]
+    for file in files:
         found.update(file.name.encode() + file.read_bytes())
     return found.hexdigest()[:16]
 
@@ -273,7 +277,13 @@ _RECOVERED = (
 
 
 def _identify(limb: str, row: Mapping[str, Any]) -> Result:
-    """Compare what a calibration found with what the seed drew, and predict an unseen motion."""
+    """Compare what a calibration found with what the seed drew, and predict an unseen motion.
+
+    Raises:
+        StudyError: there is no calibration.
+    """
+    if row["calibration"] == "none":
+        raise StudyError("calibration none finds nothing: choose quick or long")
     found, report = Twin.of(row).fit(limb_of(limb))
     distances: dict[str, list[float]] = {}
     for name, known in known_values(draw(row["seed"])).items():

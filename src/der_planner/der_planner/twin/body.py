@@ -260,6 +260,7 @@ class NodeLoads:
 
     def update(self, time: float) -> None:
         """Put what acts at a time [s] on the nodes."""
+        self._pushes = [each for each in self._pushes if each[0].end > time]
         acting = [(push, shares) for push, shares in self._pushes if push.acts(time)]
         self._mass[:] = self._own_mass
         for push, shares in acting:

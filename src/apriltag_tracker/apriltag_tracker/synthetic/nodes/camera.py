@@ -62,21 +62,21 @@ class SyntheticCameraNode(ShapeListener):
         self._publish_info()
 
     def _image_message(self) -> Image:
-        size = self._camera.model.intrinsics
-        message = Image(height=size.height, width=size.width, encoding="mono8", step=size.width)
+        lens = self._camera.model.intrinsics
+        message = Image(height=lens.height, width=lens.width, encoding="mono8", step=lens.width)
         message.header.frame_id = FRAME
         return message
 
     def _info_message(self) -> CameraInfo:
-        size = self._camera.model.intrinsics
+        lens = self._camera.model.intrinsics
         message = CameraInfo(
-            height=size.height,
-            width=size.width,
-            distortion_model="plumb_bob",
-            d=size.distortion[:5].tolist(),
-            k=size.matrix.ravel().tolist(),
+            height=lens.height,
+            width=lens.width,
+            distortion_model="rational_polynomial",
+            d=lens.distortion.tolist(),
+            k=lens.matrix.ravel().tolist(),
             r=np.eye(3).ravel().tolist(),
-            p=np.hstack([size.matrix, np.zeros((3, 1))]).ravel().tolist(),
+            p=np.hstack([lens.matrix, np.zeros((3, 1))]).ravel().tolist(),
         )
         message.header.frame_id = FRAME
         return message

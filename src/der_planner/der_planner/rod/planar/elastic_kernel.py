@@ -22,6 +22,7 @@ class PlanarRod(NamedTuple):
     """The numbers of a rod in a plane."""
 
     rest: Array  # (n-1,) edge lengths at rest ē [m]
+    shortest: float  # of them [m]
     axial: Array  # (n-1,) EA [N]
     bend: Array  # (n,) EI/l [N·m]
     rest_kappa: Array  # (n,) κ̄

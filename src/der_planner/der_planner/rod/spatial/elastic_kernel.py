@@ -26,6 +26,7 @@ class SpatialRod(NamedTuple):
     """The numbers of a rod in space."""
 
     rest: Array  # (n-1,) edge lengths at rest ē [m]
+    shortest: float  # of them [m]
     axial: Array  # (n-1,) EA [N]
     bend: Array  # (n,) EI/l [N·m]
     twist: Array  # (n,) GJ/l [N·m]

@@ -19,7 +19,6 @@ from der_planner.rod.banded_kernel import (
     hold_fixed,
     hold_rows,
     put,
-    smallest,
     solve_10,
     solve_columns,
 )
@@ -101,9 +100,9 @@ def newton(
     base, body, fixed = space.base, rod.body, rod.body.fixed
     limit, lever = solver.limit, solver.lever
     size = x.shape[0]
-    largest, careful = 2.0 * smallest(rod.rest), 0.1 * smallest(rod.rest)
+    largest, careful = 2.0 * rod.shortest, 0.1 * rod.shortest
     update = np.inf
-    convex = rate < 0.0
+    convex = False
     for iteration in range(limit):
         for k in range(size):
             v[k] = (x[k] - x_n[k]) * rate
@@ -159,7 +158,7 @@ def simulate(
     x, acceleration = space.x, space.acceleration
     acceleration[:] = 0.0
     stages = solver.extrapolate.shape[0]
-    rate, far = 1.0 / solver.h, 0.5 * smallest(rod.rest)
+    rate, far = 1.0 / solver.h, 0.5 * rod.shortest
     total = 0
     for index in range(begin, intervals * steps):
         k, step = index // steps, index % steps
