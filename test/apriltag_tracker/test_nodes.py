@@ -182,7 +182,7 @@ def test_poses_of_motion_capture_become_the_tip(graph, states, config, tags, tmp
     text = (config / "bodies.yaml").read_text().replace("length_unit: m ", "length_unit: mm ")
     body_map.write_text(text)
     mapped = {"body_map": str(body_map)}
-    mocap = graph.start("apriltag_tracker", "synthetic_poses", dropout=0.02, up="y", **mapped)
+    mocap = graph.start("apriltag_tracker", "synthetic_poses", dropout=0.02, y_up=True, **mapped)
     tracker = graph.start("apriltag_tracker", "pose_tracker", **mapped)
     client = graph.client
     client.watch([mocap, tracker])

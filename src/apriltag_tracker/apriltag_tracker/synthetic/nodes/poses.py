@@ -12,7 +12,7 @@ from apriltag_tracker.bodies.body_map import BodyMap
 from apriltag_tracker.bodies.forms import message_type, topics_of
 from apriltag_tracker.installed import CONFIG
 from apriltag_tracker.synthetic.nodes import ShapeListener
-from apriltag_tracker.synthetic.poses import UPRIGHT, MocapFaults, SyntheticMocap
+from apriltag_tracker.synthetic.poses import MocapFaults, SyntheticMocap
 from apriltag_tracker.synthetic.shapes import Shape
 from limb_interfaces import qos, stamps
 from limb_interfaces.parameters import check_overrides, declare
@@ -39,7 +39,7 @@ class SyntheticPosesNode(ShapeListener):
             dropout=number("dropout", 0.0, "share of frames without a body", 0.0, 1.0),
         )
         tilt = number("tilt", 0.0, "of the plane of motion against the floor [rad]", -2.0, 2.0)
-        up = str(declare(self, "up", "z", "axis that points up", choices=tuple(UPRIGHT)))
+        up = "y" if declare(self, "y_up", False, "the axis y points up, in place of z") else "z"
         check_overrides(self)
         bodies = BodyMap.from_yaml(str(body_map))
         self._mocap = SyntheticMocap(bodies, faults, tilt=tilt, seed=int(seed), up=up)
