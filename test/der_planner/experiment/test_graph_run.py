@@ -24,7 +24,7 @@ def test_a_driver_that_does_not_vent_is_told_of_and_its_port_is_given_time(error
     assert [call.args for call in client.call.call_args_list] == [("pressure_driver/vent",)]
     assert client.watch.call_args_list[0].args == ((driver,),)  # its end is not waited for
     assert [call.args for call in client.spin.call_args_list] == [(PORT_VENTS,)]
-    warned = f"may still be under pressure ({error}); close its air supply"
+    warned = f"may still be under pressure; close its air supply ({error})"
     assert warned in capsys.readouterr().err
 
 

@@ -286,7 +286,7 @@ class RunningGraph:
             self._vent()
         except (GraphError, NodeError) as error:
             self.progress.say(
-                f"  WARNING: the limb may still be under pressure ({error}); close its air supply"
+                f"  WARNING: the limb may still be under pressure; close its air supply ({error})"
             )
             self.client.watch(())
             self.client.spin(PORT_VENTS)
