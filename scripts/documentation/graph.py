@@ -63,6 +63,7 @@ def _said(client: GraphClient, given: dict[str, dict[str, Any]]) -> str:
 def _node(client: GraphClient, name: str, given: dict[str, Any]) -> dict[str, Any]:
     """Return one node's parameters and topics."""
     node, space = client.node, f"/{topics.NAMESPACE}"
+    client.wait_for(lambda: name in client.count_nodes(), PATIENCE, f"node {name}")
     ends = {
         "publishes": (
             node.get_publisher_names_and_types_by_node,

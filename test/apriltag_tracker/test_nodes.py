@@ -177,12 +177,12 @@ def test_a_source_without_calibration_is_refused_with_the_remedy(make_here):
 
 
 def test_poses_of_motion_capture_become_the_tip(graph, states, config, tags, tmp_path):
-    """The poses come in millimetres and with y up, some are lost."""
+    """The poses come in millimetres, some are lost."""
     body_map = tmp_path / "bodies.yaml"
     text = (config / "bodies.yaml").read_text().replace("length_unit: m ", "length_unit: mm ")
     body_map.write_text(text)
     mapped = {"body_map": str(body_map)}
-    mocap = graph.start("apriltag_tracker", "synthetic_poses", dropout=0.02, y_up=True, **mapped)
+    mocap = graph.start("apriltag_tracker", "synthetic_poses", dropout=0.02, **mapped)
     tracker = graph.start("apriltag_tracker", "pose_tracker", **mapped)
     client = graph.client
     client.watch([mocap, tracker])

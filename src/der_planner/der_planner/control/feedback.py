@@ -199,25 +199,14 @@ class Feedback:
         else:
             supervisor.in_time()
         planned, before = self._nominal.command(k), self._chambers.sent(k - 1)
-        correction = wanted = np.zeros_like(planned)
         try:
-            # Matrices of some ten rows: more threads only get into other processes' way.
-            with _THREADS.limit(limits=1, user_api="blas"):
-                known = self._estimator.at(instant)
-                self._feel()
-                age = instant - self._estimator.newest
-                share = supervisor.advance(instant, age, known.strange)
-                if share > 0.0:
-                    wanted = self._horizon.solve(k, known)
-                    seen = round(self._estimator.newest / CONTROL_PERIOD)
-                    shown = self._estimator.at(seen * CONTROL_PERIOD)
-                    self._benefit.see(seen, self._estimator.gap(shown, seen))
-                    correction = supervisor.calmed(instant, share * self._benefit.share * wanted)
+            wanted, correction = self._corrections(k)
+            sound = bool(np.isfinite(correction).all())
         except np.linalg.LinAlgError:
-            correction[:] = np.nan
-        if not np.isfinite(correction).all():
+            sound = False
+        if not sound:
             supervisor.stop(instant, "inconsistent", np.inf)
-            correction = wanted = np.zeros_like(planned)
+            wanted = correction = np.zeros_like(planned)
         air = self._nominal.model.air
         chambers = self._chambers.during(np.array([k * STEPS - 1]))[0]
         self._reaction.follow(planned, self.touch, chambers)
@@ -227,6 +216,24 @@ class Feedback:
         self._chambers.send(k, command)
         self._estimator.changed(instant)
         return command
+
+    def _corrections(self, k: int) -> tuple[Array, Array]:
+        """Return the correction (M,) [Pa] that is wanted in a control period, and what is sent."""
+        instant, nothing = k * CONTROL_PERIOD, np.zeros(self._nominal.model.inputs)
+        # Matrices of some ten rows: more threads only get into other processes' way.
+        with _THREADS.limit(limits=1, user_api="blas"):
+            known = self._estimator.at(instant)
+            self._feel()
+            age = instant - self._estimator.newest
+            share = self._supervisor.advance(instant, age, known.strange)
+            if share <= 0.0:
+                return nothing, nothing
+            wanted = self._horizon.solve(k, known)
+            seen = round(self._estimator.newest / CONTROL_PERIOD)
+            shown = self._estimator.at(seen * CONTROL_PERIOD)
+            self._benefit.see(seen, self._estimator.gap(shown, seen))
+            part = share * self._benefit.share * wanted
+            return wanted, self._supervisor.calmed(instant, part)
 
     def _feel(self) -> None:
         """Look at what the newest picture says of a touch, if it is known what chambers held."""

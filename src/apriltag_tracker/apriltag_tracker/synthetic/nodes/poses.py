@@ -39,10 +39,9 @@ class SyntheticPosesNode(ShapeListener):
             dropout=number("dropout", 0.0, "share of frames without a body", 0.0, 1.0),
         )
         tilt = number("tilt", 0.0, "of the plane of motion against the floor [rad]", -2.0, 2.0)
-        up = "y" if declare(self, "y_up", False, "the axis y points up, in place of z") else "z"
         check_overrides(self)
         bodies = BodyMap.from_yaml(str(body_map))
-        self._mocap = SyntheticMocap(bodies, faults, tilt=tilt, seed=int(seed), up=up)
+        self._mocap = SyntheticMocap(bodies, faults, tilt=tilt, seed=int(seed))
         kind = message_type(form)
         self._outputs = {
             name: self.create_publisher(kind, place, qos.STATES)
