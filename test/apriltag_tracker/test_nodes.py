@@ -194,8 +194,8 @@ def test_poses_of_motion_capture_become_the_tip(graph, states, config, tags, tmp
         np.array([state.tip.x, state.tip.y]) - stream.truth[nanoseconds(state.header.stamp)]
         for state in valid
     ]
-    # Noise of 0.1 mm, and stiff stretches of the map that these arcs have not. A machine that stands
-    # still publishes shapes within milliseconds, whose bodies are then put together.
+    # Noise of 0.1 mm, and stiff stretches of the map that these arcs have not. A machine that stood
+    # still sends shapes within milliseconds, whose bodies are then put together.
     assert np.median(np.linalg.norm(errors, axis=1)) < 3e-4
     told = client.wait_for(
         lambda: client.diagnostic_values("pose_tracker").get("plane_tilt_deg"), PATIENCE, "a plane"
