@@ -59,3 +59,12 @@ def test_a_driver_that_falls_silent_is_lost_and_one_that_was_never_heard_is_not(
     assert "has said nothing for 1.5 s" in found.obstacle().reason
     assert silent.obstacle() is None
     assert (found.mode, silent.mode) == ("ARMED", "")
+
+
+def test_a_state_that_is_older_than_the_motion_ends_nothing():
+    found, late = DriverWatch(lambda: 0.0, timeout=1.0), PressureState(mode=DISARMED)
+    late.header.stamp.sec = 9
+    assert found.update(late, (), asked=10_000_000_000) is None
+    assert found.obstacle() is None
+    late.header.stamp.sec = 10
+    assert found.update(late, (), asked=10_000_000_000).outcome == "vented"

@@ -53,6 +53,7 @@ class PlannerNode(Node):
         self._progress = 0.0  # share of the planning or of the playing that is done
         self._last_refusal = ""
         self._request: Request | None = None
+        self._asked = 0  # when a motion was asked for last [ns]
         self._newest: tuple[str, Plan, bool] | None = None
         self._work: queue.SimpleQueue[Request | None] = queue.SimpleQueue()
         self._output = PlannerPublishers(self)
@@ -78,7 +79,7 @@ class PlannerNode(Node):
     # What comes in -------------------------------------------------------------------------
 
     def _on_driver(self, message: PressureState) -> None:
-        ending = self._driver.update(message, self._streamer.begun)
+        ending = self._driver.update(message, self._streamer.begun, self._asked)
         if ending is not None:
             self._streamer.abandon(ending)
             self._drop_request(ending, nanoseconds(message.header.stamp))
@@ -172,7 +173,7 @@ class PlannerNode(Node):
             self._refuse(request.plan_id, obstacle.reason)
             return
         with self._streamer.lock:
-            replaced, self._request = self._request, request
+            replaced, self._request, self._asked = self._request, request, request.asked
         self._last_refusal = ""
         if replaced is not None:
             replaced.cancelled.set()

@@ -21,7 +21,7 @@ from der_planner.planning import Plan
 from der_planner.planning.streaming import GRID, Ending, Schedule
 from limb_interfaces import qos, topics
 from limb_interfaces.diagnostics import Health
-from limb_interfaces.stamps import NANOSECONDS, stamp_from_nanoseconds
+from limb_interfaces.stamps import NANOSECONDS, nanoseconds, stamp_from_nanoseconds
 
 REFERENCE = ColorRGBA(r=0.1, g=0.6, b=0.2, a=1.0)
 PREDICTED = ColorRGBA(r=0.9, g=0.5, b=0.1, a=1.0)
@@ -247,7 +247,7 @@ class DriverWatch:
         with self._changed:
             return "" if self._mode is None else _NAMES.get(self._mode, str(self._mode))
 
-    def update(self, state: PressureState, begun: Sequence[str]) -> Ending | None:
+    def update(self, state: PressureState, begun: Sequence[str], asked: int = 0) -> Ending | None:
         """Keep a new state; return why everything must be stopped because of it, or None.
 
         The driver vents by itself only after HOLDING. A ramp down at the end of an earlier plan
@@ -256,8 +256,13 @@ class DriverWatch:
         Args:
             state: from the driver.
             begun: ids of the plans whose first setpoint is due already.
+            asked: when a motion was asked for last [ns]; what an older state says does not concern
+                it, and comes late where this process was kept from running.
         """
         with self._changed:
+            if nanoseconds(state.header.stamp) < asked:
+                self._heard = self._steady()
+                return None
             before, self._mode = self._mode, int(state.mode)
             self._faults, self._heard = list(state.faults), self._steady()
             self._refused = int(state.setpoints_refused)
