@@ -60,7 +60,10 @@ def run_module(name: str) -> int:
 
 
 def _outside_of_ros_args(words: list[str]) -> list[str]:
-    """Return the words of a command line that ROS takes no notice of."""
+    """Return the words of a command line that ROS takes no notice of.
+
+    `rclpy.utilities.remove_ros_args` takes a second to load, and raises where a file is missing.
+    """
     left, is_of_ros = [], False
     for word in words:
         if word in ("--ros-args", "--"):

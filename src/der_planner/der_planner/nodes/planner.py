@@ -32,7 +32,7 @@ from limb_interfaces import qos, topics
 from limb_interfaces.diagnostics import DiagnosticsPublisher, Health
 from limb_interfaces.parameters import check_overrides
 from limb_interfaces.runner import run_node
-from limb_interfaces.stamps import NANOSECONDS, nanoseconds
+from limb_interfaces.stamps import NANOSECONDS
 
 _ARMING_PATIENCE = 0.5
 """The state of a driver that was armed just now is waited for this long [s]."""
@@ -82,7 +82,7 @@ class PlannerNode(Node):
         ending = self._driver.update(message, self._streamer.begun, self._asked)
         if ending is not None:
             self._streamer.abandon(ending)
-            self._drop_request(ending, nanoseconds(message.header.stamp))
+            self._drop_request(ending)
         elif message.mode == message.ARMED and self._status.state in _BY_DRIVER:
             self._status = Status("idle", self._status.plan_id)  # what ended the plan is over
         self._corrector.add_pressures(message)
@@ -184,17 +184,15 @@ class PlannerNode(Node):
         self._diagnostics.publish()
         self._work.put(request)
 
-    def _drop_request(self, ending: Ending, stamp: int) -> None:
-        """Refuse what was asked for before an instant [ns] at which the driver took nothing.
+    def _drop_request(self, ending: Ending) -> None:
+        """Refuse what was asked for before the driver took nothing.
 
         A request belongs to the arming in which it was made: it never plays after a later one.
         """
         with self._streamer.lock:
             request = self._request
             # Without auto_start it is only planned, and waits to be started.
-            if request is None or not self._options.auto_start or request.asked > stamp:
-                return
-            if request.cancelled.is_set():
+            if request is None or not self._options.auto_start or request.cancelled.is_set():
                 return
             request.cancelled.set()
             self._request = None

@@ -260,12 +260,11 @@ class DriverWatch:
                 it, and comes late where this process was kept from running.
         """
         with self._changed:
+            self._heard = self._steady()
             if nanoseconds(state.header.stamp) < asked:
-                self._heard = self._steady()
                 return None
             before, self._mode = self._mode, int(state.mode)
-            self._faults, self._heard = list(state.faults), self._steady()
-            self._refused = int(state.setpoints_refused)
+            self._faults, self._refused = list(state.faults), int(state.setpoints_refused)
             begins = self._mode == PressureState.VENTING and before != self._mode
             if begins:
                 self._told_to_vent = before != PressureState.HOLDING
