@@ -309,7 +309,9 @@ class BoardProcess:
         while self.core.highest_pressure() > EMPTYING_SHARE * before:
             if self.core.clock() > deadline:
                 left = self.core.highest_pressure()
-                return f"the chambers on {self._port} keep {left:.0f} Pa: {lines.ADVICE}"
+                age = self.core.monitor.telemetry_age(self.core.clock())
+                heard = f", {age:.1f} s ago," if age > EMPTYING_TIME / 2 else ""
+                return f"the chambers on {self._port} keep{heard} {left:.0f} Pa: {lines.ADVICE}"
             self._turn()
         return ""
 

@@ -294,7 +294,8 @@ class DriverCore:
         for event in events:
             self._serve(event, now)
         readings = sum(isinstance(event, Telemetry) for event in events)
-        self.monitor.count_lines(readings, self.protocol.rejected - rejected, now)
+        damaged = self.protocol.rejected - rejected
+        self.monitor.count_lines(readings, damaged, bool(events), now)
         return self.protocol.follow_up()
 
     def lost(self, reason: str) -> None:

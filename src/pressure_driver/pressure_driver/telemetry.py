@@ -25,6 +25,8 @@ MOST_BAD_READINGS = 8
 MOST_DAMAGED = 10
 """Damaged lines or frames in `READING_WINDOW`, if they are also `DAMAGED_SHARE` of all."""
 DAMAGED_SHARE = 0.3
+STRANGE_TIME = 1.0
+"""[s] in which bytes come of which nothing is understood: no piece of a line takes so long."""
 PLAUSIBLE_ATMOSPHERE = (70_000.0, 105_000.0)
 """[Pa] at 3000 m, and above what the barometer reads at sea level but for a few days in a century:
 chambers that rest higher hold trapped air, unless the parameter 'atmosphere' says otherwise."""
@@ -174,6 +176,7 @@ class TelemetryMonitor:
         self._supply_bad = Duration()
         self._below_rest = Duration()
         self._lines: deque[tuple[float, int, int, int]] = deque()
+        self._strange_since = math.nan
         self.rest.forget_readings()
 
     @property
@@ -251,9 +254,13 @@ class TelemetryMonitor:
         for chamber, value, opening in zip(self._following, gauge, self.valve_opening, strict=True):
             chamber.receive(value, opening, now)
 
-    def count_lines(self, sound: int, damaged: int, now: float) -> None:
-        """Count lines or frames that came: with readings, and damaged ones."""
+    def count_lines(self, sound: int, damaged: int, understood: bool, now: float) -> None:
+        """Count lines or frames that came: with readings, damaged; was any of them understood?"""
         self._lines.append((now, sound, damaged, 0))
+        if understood:
+            self._strange_since = math.nan
+        elif math.isnan(self._strange_since):
+            self._strange_since = now
 
     def _recent_lines(self, now: float) -> tuple[int, int, int]:
         """Return how many lines had readings, were damaged, had a reading that cannot be."""
@@ -267,21 +274,20 @@ class TelemetryMonitor:
     def silence(self, now: float) -> str:
         """Return that the board is silent or speaks without being understood, or nothing."""
         age = self.telemetry_age(now)
+        _, damaged, bad = self._recent_lines(now)
         if math.isnan(age):
-            _, damaged, bad = self._recent_lines(now)
             if bad >= MOST_BAD_READINGS:
                 return self._describe_nonsense(bad)
-            if damaged < MOST_DAMAGED:
-                return "no telemetry from the board yet"
-            line = self._protocol.last_damaged
-            return (
-                f"no telemetry from the board yet: {damaged} lines or frames of the last "
-                f"{READING_WINDOW:g} s are not of this language and number of chambers"
-                f"{line and f' (the last: {line})'}; look at 'protocol', 'baud_rate' and "
-                "'segment_count'"
-            )
+            if damaged >= MOST_DAMAGED or now - self._strange_since > STRANGE_TIME:
+                return (
+                    "no telemetry from the board yet: what it sends is not of this language and "
+                    f"number of chambers{self._last_damaged()}; look at 'protocol', 'baud_rate', "
+                    "'segment_count' and its line ends"
+                )
+            return "no telemetry from the board yet; look at its power, its cable and 'port'"
         if age > self._settings.telemetry_timeout:
-            return f"no telemetry: the last came {age:.1f} s ago"
+            damage = f"; lines are damaged{self._last_damaged()}" if damaged else ""
+            return f"no telemetry: the last came {age:.1f} s ago{damage}"
         patience = self._settings.frozen_time if self._protocol.tells_pascals else 0.0
         if 0.0 < patience < self._read_at - self._changed_at:
             return (
@@ -290,11 +296,16 @@ class TelemetryMonitor:
             )
         return ""
 
+    def _last_damaged(self) -> str:
+        line = self._protocol.last_damaged
+        return line and f" (the last: {line})"
+
     def _describe_nonsense(self, count: int) -> str:
         (chamber, value), (low, high) = self._bad, self._plausible
+        hint = ", as if the board told gauge pressures" if abs(value) < low else ""
         return (
-            f"chamber {chamber} has no plausible reading: {value:.0f} Pa, and {count} of the last "
-            f"{READING_WINDOW:g} s were no number or outside {low:.0f} to {high:.0f} Pa"
+            f"chamber {chamber} has no plausible reading: {value:.0f} Pa{hint}, and {count} of the "
+            f"last {READING_WINDOW:g} s were no number or outside {low:.0f} to {high:.0f} Pa"
         )
 
     def following_faults(self, now: float) -> Iterator[str]:
@@ -335,7 +346,10 @@ class TelemetryMonitor:
         if self._protocol.reports_supply and settings.supply_required:
             timeout = settings.telemetry_timeout
             if age > timeout:
-                text = "the board has not told its supply pressure yet"
+                text = (
+                    "the board has not told its supply pressure yet; one that cannot measure it "
+                    "needs the parameter 'supply_required' at false"
+                )
                 if math.isfinite(age):
                     text = f"no reading of the supply: the last came {age:.1f} s ago"
                 yield Condition(text, lasting=timeout + settings.supply_time < age < math.inf)

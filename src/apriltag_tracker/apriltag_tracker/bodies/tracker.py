@@ -215,7 +215,7 @@ class BaseFinder:
                 "the fixed bodies that are seen tell no frame: three off a line are needed"
             )
         elif found[1] > _MISFIT:
-            apart = f"{1e3 * found[1]:.0f} mm: check their positions, names and length_unit"
+            apart = f"{1e3 * found[1]:.0f} mm: check their positions, rotations, names, length_unit"
             self.problem = f"the fixed bodies do not fit together, {apart}"
         else:
             (self.frame, self.residual), self.problem = found, ""

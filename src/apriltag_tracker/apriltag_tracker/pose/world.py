@@ -141,7 +141,8 @@ class WorldPose:
             self.pose = None
             self.problem = (
                 f"only {len(ids)} of {len(self._seen)} fixed tags fit together, {ids}, to "
-                f"{per_tag.max():.1f} px: survey positions and sizes again or calibrate the camera"
+                f"{per_tag.max():.1f} px: survey positions, sizes and yaw again (OpenCV draws tags "
+                "turned by π) or calibrate the camera"
             )
             return
         self.pose, self.excluded, self.problem = pose, excluded, ""

@@ -134,6 +134,15 @@ class BagReader:
             )
         return found
 
+    def is_installed(self, type_name: str) -> bool:
+        """Return whether a type of the bag has here the fields that it had there.
+
+        Raises:
+            DefinitionError: it is not installed here.
+        """
+        recorded: str = self._store.hash_rihs01(type_name)
+        return recorded == find_definition(type_name).type_hash
+
     @property
     def start(self) -> int:
         """Log time of the first message [ns]."""

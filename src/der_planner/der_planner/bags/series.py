@@ -115,7 +115,8 @@ def run_of(record: BagRecord, namespace: str, plan_id: str = "") -> RunSeries:
         )
     about = _describe(plan, record, namespace, feedback)
     # Planners of other people need not predict anything.
-    predicted = np.array(plan.tip_predicted).reshape(-1, 2) if len(plan.tip_predicted) else None
+    told = getattr(plan, "tip_predicted", ())
+    predicted = np.array(told).reshape(-1, 2) if len(told) else None
     wanted = np.array(plan.tip_reference).reshape(-1, 2)
     return RunSeries(
         description=about,

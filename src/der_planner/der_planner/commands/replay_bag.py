@@ -109,6 +109,12 @@ def choose_topics(bag: BagReader, wanted: Selection) -> dict[str, RecordedTopic]
         if target in chosen:
             raise BagError(f"{chosen[target].name} and {name} would both be played on {target}")
         chosen[target] = known[name]
+    others = sorted({t.type_name for t in chosen.values() if not bag.is_installed(t.type_name)})
+    if others:
+        raise BagError(
+            f"{bag.path} has another version of {', '.join(others)} than is installed here, whose "
+            "listeners would read other numbers: name the topics to play with --topics"
+        )
     return chosen
 
 

@@ -78,7 +78,8 @@ MISSED = 0.1
 """Error that a fit leaves, over the range of bend angles, from which on it misses the log."""
 _MISSES_ITS_LOG = (
     "the limb that fits the log best misses it: was it mounted and loaded as said (--mounting, "
-    "--payload), are units and columns right, and do angles and pressures have one clock?"
+    "--payload), are units and columns right, is each angle the bend of its own segment alone, and "
+    "do angles and pressures have one clock?"
 )
 _NO_CUBIC = (
     "the cubic term is left out: with it the limb that fits the log best gives way under its "

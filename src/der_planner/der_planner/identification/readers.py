@@ -161,7 +161,7 @@ class ColumnMap:
     length_unit: str = _key(str, "unit of the tip: m, cm or mm", "m")
     tags: tuple[str, ...] = _key(_names, default=())
     angle_factor: float = _key(float, default=1.0)
-    rest_until: float | str = _key(_rest_until, default=0.0)
+    rest_until: float | str = _key(_rest_until, default="auto")
     ignore: tuple[tuple[float, float], ...] = _key(_stretches, default=())
 
     @classmethod
@@ -295,7 +295,7 @@ def read_csv(path: str | Path, columns: ColumnMap) -> CalibrationLog:
         if not rest.any():
             raise LogError(
                 f"{path} has no row at rest: its commands never come within "
-                f"{100 * REST_SHARE:.0f} % of their largest to zero. Leave rest_until out of the "
+                f"{100 * REST_SHARE:.0f} % of their largest to zero. Write rest_until: 0 into the "
                 "column map if the chambers' sensors have no offset"
             )
         measured = measured - np.nanmean(measured[rest], axis=0)
