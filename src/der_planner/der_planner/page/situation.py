@@ -7,12 +7,12 @@ import shlex
 import socket
 import threading
 import time
-from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import psutil
 from diagnostic_msgs.msg import DiagnosticStatus
 from rcl_interfaces.msg import Log
@@ -52,7 +52,7 @@ LEVELS = ("ok", "warning", "error", "stale")
 REFERENCES_KEPT = 200
 _UNKNOWN: tuple[str, psutil.Process | None, str] = ("", None, "")
 GAP = NANOSECONDS // 5
-"""No reference is interpolated between two that are further apart than this [ns]."""
+"""References that are further apart than this [ns] are not of one motion."""
 
 
 class Situation:
@@ -155,8 +155,9 @@ class Situation:
     def put_reference(self, stamp: int, x: float, y: float) -> None:
         """Take where the tip should be [m] at an instant [ns], which may lie ahead."""
         with self._lock:
-            if self._references and stamp <= self._references[-1][0]:
-                self._references.clear()  # a newer plan took over
+            newest = self._references[-1][0] if self._references else stamp
+            if not 0 < stamp - newest <= GAP:
+                self._references.clear()  # a newer plan took over, or begins after a pause
             self._references.append((stamp, x, y))
 
     def put_status(self, status: DiagnosticStatus) -> None:
@@ -212,20 +213,12 @@ class Situation:
     def reference_at(self, stamp: int) -> tuple[float, float] | None:
         """Return where the tip should be [m] at an instant [ns]; None where no plan says it."""
         with self._lock:
-            references = list(self._references)
-        after = bisect_left(references, (stamp, -math.inf, -math.inf))
-        if after == len(references):
+            references = np.array(self._references).reshape(-1, 3)
+        stamps, *places = references.T
+        if not len(stamps) or not stamps[0] <= stamp <= stamps[-1]:
             return None
-        late, x1, y1 = references[after]
-        if late == stamp:
-            return x1, y1
-        if after == 0:
-            return None
-        early, x0, y0 = references[after - 1]
-        if late - early > GAP:
-            return None
-        share = (stamp - early) / (late - early)
-        return x0 + share * (x1 - x0), y0 + share * (y1 - y0)
+        x, y = (float(np.interp(stamp, stamps, axis)) for axis in places)
+        return x, y
 
     @property
     def limit(self) -> float:
