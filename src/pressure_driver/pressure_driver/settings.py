@@ -206,7 +206,6 @@ class EmulatorSettings:
     wiring: str = _other(
         "", "chamber of the limb that each valve fills, as 3,4,2,1; empty: each its own"
     )
-    reset_on_open: bool = _other(True, "opening the port restarts the board")
     real_time_priority: int = _number(10, "", 0, 90, "SCHED_FIFO; 0: none")
     faults: str = _other("", 'e.g. "stick:1,leak:2"; may be set while it runs', changeable=True)
 

@@ -56,7 +56,6 @@ class BoardEmulator(Node):
             lambda stamp, air: self._keep(topics.TWIN_CHAMBER_PRESSURES, stamp, air.tolist()),
             partial(self._keep, topics.TWIN_BOARD_COMMANDS),
             settings.real_time_priority,
-            settings.reset_on_open,
         )
         self._runner.set_faults(faults)
         self.add_on_set_parameters_callback(self._on_parameters)

@@ -36,8 +36,6 @@ class BoardRunner:
         on_command: takes the wall time [ns] at which a command has come, and its pressures (2M,)
             [Pa], absolute.
         real_time_priority: SCHED_FIFO priority, 0 for none.
-        reset_on_open: a host that opens the port restarts the board, as on boards whose reset is
-            wired to DTR.
     """
 
     def __init__(
@@ -47,7 +45,6 @@ class BoardRunner:
         on_air: Callable[[int, NDArray[np.float64]], None] = lambda *_: None,
         on_command: Callable[[int, tuple[float, ...]], None] = lambda *_: None,
         real_time_priority: int = 0,
-        reset_on_open: bool = True,
     ) -> None:
         self.board = board
         self.port = port
@@ -56,7 +53,6 @@ class BoardRunner:
         self._on_air = on_air
         self._on_command = on_command
         self._priority = real_time_priority
-        self._reset_on_open = reset_on_open
         self._requests: deque[Faults] = deque()
         self._delayed: deque[tuple[int, bytes]] = deque()
         self._replug_at = math.inf
@@ -114,7 +110,7 @@ class BoardRunner:
                 self.port.send(self._delayed.popleft()[1])
 
     def _serve_line(self, now: int) -> None:
-        if self.port.read(now) and self._reset_on_open:
+        if self.port.read(now):  # as on boards whose reset is wired to DTR
             self.port.send(self.board.boot())
         for stamp, data in self.port.arrived(now):
             commands, answer = self.board.receive(data)
