@@ -11,7 +11,7 @@ import numpy as np
 from sensor_msgs.msg import CameraInfo, Image
 
 from apriltag_tracker.installed import CONFIG
-from apriltag_tracker.synthetic.camera import CameraModel, Errors, Optics, SyntheticCamera
+from apriltag_tracker.synthetic.camera import CameraModel, Optics, SyntheticCamera
 from apriltag_tracker.synthetic.nodes import ShapeListener
 from apriltag_tracker.synthetic.shapes import Shape
 from apriltag_tracker.tag_map import TagMap
@@ -33,25 +33,17 @@ class SyntheticCameraNode(ShapeListener):
         tag_map = read("tag_map", str(CONFIG / "tags.yaml"), "YAML file: where the tags are")
         looks = "YAML file: lens and place of the rendered camera"
         camera = read("camera_file", str(CONFIG / "synthetic_camera.yaml"), looks)
-        seed = read("seed", 0, "of noise, floor and set-up errors", at_least=0)
-        blurred, lit = "blur of the lens, standard deviation in px", "light's range over its mean"
+        seed = read("seed", 0, "of noise and floor", at_least=0)
+        blurred = "blur of the lens, standard deviation in px"
         optics = Optics(
             noise=read("noise", Optics.noise, "noise of a pixel, grey levels", 0.0, 30.0),
             blur=read("blur", Optics.blur, blurred, 0.0, 4.0),
             exposure=read("exposure", Optics.exposure, "exposure time in s", 0.0, 0.1),
-            light_fall=read("light_fall", Optics.light_fall, lit, 0.0, 1.0),
-        )
-        surveyed, mounted = "how far fixed tags are from the tag map, in m", "the same of limb tags"
-        errors = Errors(
-            survey=read("survey_error", 0.0, surveyed, 0.0, 0.01),
-            mounting=read("mounting_error", 0.0, mounted, 0.0, 0.01),
-            mounting_angle=read("mounting_angle_error", 0.0, "limb tags' turn, in rad", 0.0, 0.3),
         )
         check_overrides(self)
         tags = TagMap.from_yaml(str(tag_map))
-        self._camera = SyntheticCamera(
-            CameraModel.from_yaml(str(camera)), tags, optics, errors, int(seed)
-        )
+        model = CameraModel.from_yaml(str(camera))
+        self._camera = SyntheticCamera(model, tags, optics, seed=int(seed))
         self._before: tuple[int, Shape] | None = None
         self._image = self._image_message()
         self._info = self._info_message()
