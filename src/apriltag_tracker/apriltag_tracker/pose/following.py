@@ -162,7 +162,7 @@ class LimbFollower:
         # A pause is no motion: frames are counted by their usual time, too.
         if not 0.0 < share < self._options.bridge_frames + 0.5:
             return None
-        going = ("tip", "tip_heading", "bend_angle", "curvature", "curve")
+        going = ("tip", "bend_angle", "curvature", "curve")
         gone = {name: share * (getattr(new, name) - getattr(old, name)) for name in going}
         # How wrong the continuation can be: as far as the limb went meanwhile, and a millimetre.
         growth = np.outer(gone["tip"], gone["tip"]) + 1e-6 * np.eye(2)

@@ -109,7 +109,6 @@ class LimbEstimate:
         tip: (2,) m.
         tip_covariance: (2, 2) m², noise of this image's corners and of the camera's pose.
         tip_systematic: (2, 2) m², what averaging does not remove: survey, height, mounting.
-        tip_heading: [rad].
         bend_angle: (M,) rad, heading at the end of each segment less that at its start, of the
             smooth fit: a limb with stiff fittings is no arc, arcs would mix the segments' bends.
         bend_angle_sigma: (M,) rad.
@@ -124,7 +123,6 @@ class LimbEstimate:
     tip: NDArray[np.float64]
     tip_covariance: NDArray[np.float64]
     tip_systematic: NDArray[np.float64]
-    tip_heading: float
     bend_angle: NDArray[np.float64]
     bend_angle_sigma: NDArray[np.float64]
     curvature: NDArray[np.float64]
@@ -328,7 +326,6 @@ class ShapeFitter:
             tip=curve[-1, :2],
             tip_covariance=noise,
             tip_systematic=systematic,
-            tip_heading=float(curve[-1, 2]),
             bend_angle=fit.parameters[means] * bending,
             bend_angle_sigma=np.sqrt(variance) * bending,
             curvature=arcs.parameters[4:],
