@@ -61,12 +61,11 @@ class RawMessage:
 class BagReader:
     """An open bag; a context manager.
 
+    What is whole of a bag that was cut short or damaged is read from a recovered copy in the
+    temporary folder.
+
     Args:
         path: a bag folder, or one ``.mcap`` or ``.db3`` file.
-
-    Attributes:
-        unfinished: its recorder was killed, or it is damaged: what is whole of it is read, from a
-            recovered copy in the temporary folder.
 
     Raises:
         BagError: nothing readable is there.
@@ -75,7 +74,6 @@ class BagReader:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self._stack = contextlib.ExitStack()
-        self.unfinished = False
         if not self.path.exists():
             raise BagError(f"no bag at {self.path}")
         try:
@@ -94,10 +92,8 @@ class BagReader:
         self._stack.close()
 
     def _open(self) -> Reader:
-        try:
+        with contextlib.suppress(Exception):  # rosbags raises many kinds for what is not whole
             return self._stack.enter_context(Reader(self.path))
-        except Exception:  # rosbags raises many kinds for what is not whole
-            self.unfinished = True
         folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="bag_")))
         recovered = recover_bag(self.path, folder / self.path.stem).folder
         return self._stack.enter_context(Reader(recovered))
