@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from der_planner.arrays import rms_distance
 from der_planner.bags.run import Description, PressureArrays, RunSeries, method_name
 from der_planner.bags.series import described
 from der_planner.control import Feedback, lockstep
@@ -80,10 +81,9 @@ def _play(planned: Plan, run: TrialRun) -> tuple[Played, dict[str, Any]]:
     played = lockstep.play(planned, plant, feedback, lockstep.Sensors(seed=trial.seed))
     if feedback is None:
         return played, {}
-    size = np.linalg.norm(played.estimated_tip - played.tip, axis=1)
     return played, {
         **described(played.correction, np.empty(0)),
-        "estimate_rms_m": float(np.sqrt(np.mean(size**2))),
+        "estimate_rms_m": rms_distance(played.estimated_tip - played.tip),
         "warnings": [f"{w.time:.2f} s: {w.name}, {w.message}" for w in feedback.warnings],
     }
 

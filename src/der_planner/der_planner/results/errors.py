@@ -163,10 +163,10 @@ def check_tracker(tip: Stream, truth: Stream | None, first: float, last: float) 
     tip = tip.known.between(max(first, truth.time[0]), min(last, truth.time[-1]))
     if not len(tip):
         return {}
-    distance = np.linalg.norm(tip.value - truth.at(tip.time), axis=1)
+    apart = tip.value - truth.at(tip.time)
     return {
-        "tracker_rms_m": float(np.sqrt(np.mean(distance**2))),
-        "tracker_max_m": float(distance.max()),
+        "tracker_rms_m": rms_distance(apart),
+        "tracker_max_m": float(np.linalg.norm(apart, axis=1).max()),
         "tracker_samples": len(tip),
     }
 

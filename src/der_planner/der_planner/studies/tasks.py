@@ -22,7 +22,7 @@ import yaml
 from threadpoolctl import threadpool_limits
 
 import der_planner
-from der_planner.arrays import Array
+from der_planner.arrays import Array, rms_distance
 from der_planner.control import Feedback, Learner, lockstep
 from der_planner.identification import FitReport, calibrate_twin, predict, record_twin
 from der_planner.identification.excitation import TIP_NOISE, Excitation
@@ -182,7 +182,7 @@ def _errors(planned: Plan, tip: Array) -> Result:
         "mean_error_m": float(distance.mean()),
         "mean_error_x_m": float(np.abs(error[:, 0]).mean()),
         "mean_error_y_m": float(np.abs(error[:, 1]).mean()),
-        "rms_error_m": float(np.sqrt(np.mean(distance**2))),
+        "rms_error_m": rms_distance(error),
         "max_error_m": float(distance.max()),
         "predicted_error_m": planned.predicted_error,
     }
