@@ -32,7 +32,7 @@ class Progress:
         self.newest = "begins"
         """What has been said last, for who shows it elsewhere."""
         self.failed = False
-        """Whether that is why the command has failed."""
+        """Whether `newest` says why the command has failed."""
 
     def say(self, text: str) -> None:
         """Print one line."""

@@ -20,7 +20,7 @@ pressure, setpoint, diagnosis. A negative setpoint would make it go wild: none i
 
 A frame of Modbus TCP is ``transaction u16, 0 u16, length u16, unit u8, function u8, data``, all
 big-endian; the length counts what follows it. (Modbus Messaging on TCP/IP Implementation Guide
-V1.0b.) Register numbers are those on the wire, which count from 0, as in lib
+V1.0b.) Register numbers are those on the wire, which count from 0.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """A lab's own driver of valves as a board: pressures go out on its topic and come back on another.
 
-To the pressure driver this node is a `native` board at `tcp://host:port`, so that everything which
-that watches is watched here as well. What a native board has to do by itself it does, too: it vents
-when setpoints cease to come.
+To the pressure driver this node is a `native` board at `tcp://host:port`: the driver watches it as
+it watches other boards. As a native board must, this node vents by itself when setpoints cease.
 """
 
 from __future__ import annotations
