@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from benchmarks import show
 from der_planner.identification import CalibrationLog, FitReport, fit, predict, record_twin
-from der_planner.identification.excitation import PERIOD, Excitation, calibration_run
+from der_planner.identification.excitation import calibration_run
 from der_planner.identification.terms import GROUPS
 from der_planner.limb import Limb
+from der_planner.studies.tasks import UNSEEN_RUN, unseen_motion
 
 Figures = dict[str, float | str]
 
@@ -35,12 +36,6 @@ LADDER: tuple[tuple[str, ...], ...] = (
 """Model terms in the order in which they are added."""
 
 
-def _unseen() -> Excitation:
-    instants = np.arange(0.0, 40.0, PERIOD)
-    waves = [1.0 - np.cos(instants / 3.0), np.sin(instants / 2.0)]
-    return Excitation(instants, 9000.0 * np.stack(waves, axis=1))
-
-
 def _fitted(log: CalibrationLog, terms: Iterable[str] = GROUPS) -> tuple[Limb, FitReport, float]:
     begin = time.process_time()
     limb, report = fit(Limb.default(), log, terms=terms)
@@ -58,7 +53,7 @@ def run(quick: bool) -> Figures:
     """Measure; prints tables and returns every figure."""
     seeds = FRESH_SEEDS[:2] if quick else FRESH_SEEDS
     logs = {seed: record_twin(seed, calibration_run(AMPLITUDE, quick=quick)) for seed in seeds}
-    unseen = {seed: record_twin(seed, _unseen(), run=2) for seed in seeds}
+    unseen = {seed: record_twin(seed, unseen_motion(), run=UNSEEN_RUN) for seed in seeds}
     figures = _time(logs[seeds[0]], quick)
     return figures | _terms(logs, unseen)
 

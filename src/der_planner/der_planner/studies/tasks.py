@@ -47,7 +47,7 @@ Values = Mapping[str, Value]
 Result = dict[str, float]
 _FIRST_LEARNING_RUN = 10
 """Runs of a twin's hardware from here on are learned from; the one that counts is run 0."""
-_UNSEEN_RUN = 2
+UNSEEN_RUN = 2
 """The run of a twin's hardware on which an identified limb is tried."""
 _PARTS = ("limb", "rod", "model", "estimation", "identification", "twin", "planning", "control")
 """Parts of der_planner on which a row and a calibrated twin depend."""
@@ -276,6 +276,13 @@ _RECOVERED = (
 )
 
 
+def unseen_motion() -> Excitation:
+    """Return pressures that no calibration has played."""
+    instants = np.arange(0.0, 40.0, CONTROL_PERIOD)
+    waves = [1.0 - np.cos(instants / 3.0), np.sin(instants / 2.0)]
+    return Excitation(instants, 9000.0 * np.stack(waves, axis=1))
+
+
 def _identify(limb: str, row: Mapping[str, Any]) -> Result:
     """Compare what a calibration found with what the seed drew, and predict an unseen motion.
 
@@ -293,10 +300,7 @@ def _identify(limb: str, row: Mapping[str, Any]) -> Result:
             (unknown.value - known.value) / deviation
         )
     together = np.abs(np.concatenate(list(distances.values())))
-    instants = np.arange(0.0, 40.0, 0.05)
-    waves = [1.0 - np.cos(instants / 3.0), np.sin(instants / 2.0)]
-    unseen = Excitation(instants, 9000.0 * np.stack(waves, axis=1))
-    log = record_twin(row["seed"], unseen, run=_UNSEEN_RUN, noise=0.0, limb=found)
+    log = record_twin(row["seed"], unseen_motion(), run=UNSEEN_RUN, noise=0.0, limb=found)
     tip = predict(found, log.time, log.measured_differential).tip
     error = np.linalg.norm(tip - log.tip, axis=1)
     return {
