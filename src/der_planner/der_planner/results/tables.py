@@ -8,7 +8,7 @@ import io
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from typing import TypeVar
 
 from der_planner.results.evaluation import NEAREST
@@ -193,9 +193,7 @@ def csv_table(rows: Sequence[Summary]) -> str:
     """Return the table as CSV, in SI units with the unit in each column's name."""
     names = [field.name for field in fields(Summary) if field.name != "problems"]
     text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(names)
-    for row in rows:
-        values = [getattr(row, name) for name in names]
-        writer.writerow(["" if isinstance(v, float) and math.isnan(v) else v for v in values])
+    writer = csv.DictWriter(text, names, extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(asdict(row) for row in rows)
     return text.getvalue()
