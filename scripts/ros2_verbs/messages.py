@@ -151,20 +151,6 @@ class Filled:
             if isinstance(value, (Mapping, list)) or value is None:
                 raise TypeError(path)
             return str(value)
-        return _number(kind.typename, value)
-
-
-def _number(type_name: str, value: Any) -> float | int | bytes:
-    """Return a number of a basic type; texts count, since YAML reads ``1e-3`` as one."""
-    if type_name == "boolean":
-        if value not in (0, 1):
-            raise ValueError(value)
-        return bool(value)
-    if isinstance(value, bool):
-        raise TypeError(value)
-    if type_name in ("float", "double"):
-        return float(value)
-    whole = int(value)
-    if not isinstance(value, str) and whole != value:
-        raise ValueError(value)
-    return bytes([whole]) if type_name == "octet" else whole
+        if kind.typename in ("float", "double"):
+            return float(value)  # YAML reads ``1e-3`` as a text
+        return bytes([value]) if kind.typename == "octet" else value

@@ -93,7 +93,6 @@ def test_a_wrong_value_is_refused_by_its_field_and_not_rounded():
         (Pose, "{position: {x: wide}}", "'position.x' of type double cannot be 'wide'"),
         (Pose, "{position: 3}", "'position' takes a dictionary"),
         (Int32, "{data: 1.5}", "'data' of type int32 cannot be 1.5"),
-        (Int32, "{data: true}", "'data'"),
         (Byte, "{data: 256}", "'data'"),
         (Float32, "{data: 1.0e+39}", "'data'"),
         (PoseWithCovariance, "{covariance: [1.0, 2.0]}", "'covariance'"),
@@ -101,7 +100,6 @@ def test_a_wrong_value_is_refused_by_its_field_and_not_rounded():
     ):
         with pytest.raises(CommandError, match=re.escape(complaint)):
             fill(kind, text)
-    assert fill(Int32, "{data: 2.0}").data == 2
     assert fill(Byte, "{data: 7}").data == b"\x07"
 
 
