@@ -64,6 +64,13 @@ Kept = list[tuple[Trial, dict[str, Any]]]
 """Finished runs, each with what the ledger holds of it."""
 FAILURES = (GraphError, NodeError, PlanningError, LearningError, LogError, OSError)
 """What may end an experiment before its last trial."""
+SAME = (
+    *("amplitude", "period", "cycles", "calibrate", "offline"),
+    *("poses", "board", "reaction", "force_limit"),
+)
+"""Options that an experiment which goes on must share with the stopped one."""
+SAME_FILES = ("limb", "path", "obstacles")
+"""Options whose files must have the same content."""
 
 
 @command(*FAILURES, stopped="the same --out goes on from here")
@@ -140,22 +147,10 @@ class Ledger:
     def __init__(self, options: Options) -> None:
         self._folder = options.out / "trials"
         self._settings = {
-            "amplitude": options.amplitude,
-            "period": options.period,
-            "cycles": options.cycles,
-            "limb_sha256": _digest(options.limb),
-            "path_sha256": _digest(options.path),
-            "mounting": options.load.mounting,
-            "payload": options.load.payload or "",
-            "payload_at": options.load.payload_at or "",
-            "calibrate": options.calibrate,
-            "offline": options.offline,
-            "poses": "yes" if options.poses else "",
+            **{name: getattr(options, name) for name in SAME},
+            **{f"{name}_sha256": _digest(getattr(options, name)) for name in SAME_FILES},
+            **options.load._asdict(),
             "hardware": options.hardware.place if options.hardware else "",
-            "board": options.board,
-            "obstacles_sha256": _digest(options.obstacles),
-            "reaction": options.reaction,
-            "force_limit": options.force_limit or "",
             "library": str(options.library or ""),
         }
 
@@ -170,7 +165,7 @@ class Ledger:
             return None
         kept = json.loads(path.read_text())
         for key, value in {**self._settings, "seed": trial.seed}.items():
-            found = kept["settings"].get(key, "")
+            found = kept["settings"].get(key)
             if found != value:
                 raise OptionError(
                     f"{path.parent.parent} holds {trial.name} with {key} = {found}, not {value}: "
