@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from typing import Any
 
 import numpy as np
@@ -32,16 +31,11 @@ class SyntheticPosesNode(ShapeListener):
         )
         form = str(declare(self, "form", _FORMS[0], "messages in which poses go", choices=_FORMS))
         seed = declare(self, "seed", 0, "of noise and dropouts", at_least=0)
-        number = functools.partial(declare, self)
-        faults = MocapFaults(
-            position_noise=number("position_noise", 1e-4, "of a coordinate [m]", 0.0, 0.01),
-            direction_noise=number("direction_noise", 2e-3, "of a turn [rad]", 0.0, 0.3),
-            dropout=number("dropout", 0.0, "share of frames without a body", 0.0, 1.0),
-        )
-        tilt = number("tilt", 0.0, "of the plane of motion against the floor [rad]", -2.0, 2.0)
+        dropout = declare(self, "dropout", 0.0, "share of frames without a body", 0.0, 1.0)
         check_overrides(self)
         bodies = BodyMap.from_yaml(str(body_map))
-        self._mocap = SyntheticMocap(bodies, faults, tilt=tilt, seed=int(seed))
+        faults = MocapFaults(position_noise=1e-4, direction_noise=2e-3, dropout=float(dropout))
+        self._mocap = SyntheticMocap(bodies, faults, seed=int(seed))
         kind = message_type(form)
         self._outputs = {
             name: self.create_publisher(kind, place, qos.STATES)
