@@ -205,7 +205,6 @@ class Estimator:
             tip=tip + self.nominal.moved_tip(bend, change) + offset,
             missing_pressure=missing,
             gain_error=gain,
-            effective_pressure=known.effective,
             tip_offset=offset,
             stiffness_ratio=known.stiffness_ratio,
             deviation=deviation[:-1],

@@ -21,7 +21,6 @@ class Estimate:
         missing_pressure: (M,) effective pressure that the model lacks, its gain error not counted
             [Pa].
         gain_error: (M,) relative error of the model's effective pressure.
-        effective_pressure: (M,) of the model, without either [Pa].
         tip_offset: (2,) displacement of the tip that the bend does not explain [m].
         stiffness_ratio: how many times stiffer than its model the limb is, as its swings tell.
         deviation: (4M + 2,) standard deviations of bend_angle, bend_rate, missing_pressure,
@@ -36,7 +35,6 @@ class Estimate:
     tip: Array
     missing_pressure: Array
     gain_error: Array
-    effective_pressure: Array
     tip_offset: Array
     stiffness_ratio: float
     deviation: Array
