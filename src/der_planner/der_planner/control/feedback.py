@@ -107,11 +107,6 @@ class Feedback:
         """Whether something touches the limb, for which it is to be vented."""
         return self._reaction.vents
 
-    @property
-    def innovations(self) -> list[tuple[float, float, int]]:
-        """(time [s], squared normalised distance, coordinates) of every measurement."""
-        return self._estimator.innovations
-
     def remember(self, earlier: Feedback) -> None:
         """Begin with what an earlier run of this limb has told of it.
 
