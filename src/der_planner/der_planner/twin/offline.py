@@ -31,7 +31,6 @@ class Playback:
         bend_angles: (K, M) true bend angles [rad].
         commanded_differential: (K, M) as given [Pa].
         measured_differential: (K, M) differential pressures in the chambers [Pa].
-        chamber_pressure: (K, 2M) absolute [Pa].
     """
 
     time: Array
@@ -39,7 +38,6 @@ class Playback:
     bend_angles: Array
     commanded_differential: Array
     measured_differential: Array
-    chamber_pressure: Array
 
 
 class OfflineTwin:
@@ -139,12 +137,12 @@ def play(
     instants, wanted = _checked(time, differential_pressure)
     limb = OfflineTwin(seed, run, segment_count=wanted.shape[1], gravity=gravity, masses=masses)
     tip = np.empty((instants.size, 2))
-    angles, chambers = np.empty_like(wanted), np.empty((instants.size, 2 * wanted.shape[1]))
+    angles, measured = np.empty_like(wanted), np.empty_like(wanted)
     for push in pushes:
         limb.twin.push(replace(push, instant=push.instant - instants[0] + LEAD))
     limb.rest(LEAD)
     for k, setpoint in enumerate(wanted):
-        tip[k], angles[k], chambers[k] = limb.tip, limb.bend_angles, limb.pneumatics.pressure
+        tip[k], angles[k], measured[k] = limb.tip, limb.bend_angles, limb.differential_pressure
         limb.command(setpoint)
         if k + 1 < instants.size:
             limb.rest(instants[k + 1] - instants[k])
@@ -153,8 +151,7 @@ def play(
         tip=tip,
         bend_angles=angles,
         commanded_differential=wanted,
-        measured_differential=chambers[:, 0::2] - chambers[:, 1::2],
-        chamber_pressure=chambers,
+        measured_differential=measured,
     )
 
 
