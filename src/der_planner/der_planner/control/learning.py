@@ -112,11 +112,10 @@ class Learner:
 
     def __init__(self, plan: Plan) -> None:
         try:
-            self._correction = Correction(plan)
+            self._of_file = Correction(plan)
         except PlanningError as error:
             raise LearningError(str(error)) from error
         self.history: list[LearningRun] = []
-        self._of_file = self._correction
         self._plan = plan
         self._pending: PlayedRun | None = None
         self._beyond: Array | None = None

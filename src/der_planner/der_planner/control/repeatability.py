@@ -148,17 +148,16 @@ class Runs:
 
     def expected(self, commands: Array) -> Expected | None:
         """Return what the model expects under commands that were played; None: never played."""
-        for run in self._all:
-            if np.array_equal(run.commands, commands):
-                return run.expected
-        return None
+        played = (run.expected for run in self._all if np.array_equal(run.commands, commands))
+        return next(played, None)
 
     def known(self, about: PlayedRun) -> Known:
         """Return what all runs say of the disturbance under the commands of one run."""
         count = len(self._reference)
         total, weights, squares = np.zeros((count, 2)), np.zeros(count), np.zeros(count)
         for run in self._all:
-            doubt = self.repeats.variance(self._movement(run, about)) + run.shown.variance
+            movement = self._movement(run.expected.pressure - about.expected.pressure)
+            doubt = self.repeats.variance(movement) + run.shown.variance
             weight = np.where(run.shown.seen, 1.0 / np.maximum(doubt, 1e-14), 0.0)
             total += weight[:, None] * np.nan_to_num(run.shown.value)
             weights += weight
@@ -212,24 +211,25 @@ class Runs:
         Args:
             change: (K, M) of the commands [Pa].
         """
-        movement = float((change**2).sum(axis=1).mean()) / 2 * self._tip_per_pressure**2
-        return float(np.sqrt(np.pi / 2 * movement)) * self.repeats.share
+        return float(np.sqrt(np.pi / 2 * self._movement(change))) * self.repeats.share
 
-    def _movement(self, one: PlayedRun, other: PlayedRun) -> float:
-        """Return how far a change of commands moves the tip, segment by segment, squared [m²]."""
-        change = one.expected.pressure - other.expected.pressure
+    def _movement(self, change: Array) -> float:
+        """Return how far a change of pressures (K, M) [Pa] moves the tip, squared [m²].
+
+        It is that of a coordinate, segment by segment.
+        """
         return float((change**2).sum(axis=1).mean()) / 2 * self._tip_per_pressure**2
 
     def _pairs(self) -> list[tuple[float, float, float]]:
         """Return what `estimate` compares of every two runs."""
         result = []
-        for place, one in enumerate(self._all):
-            for other in self._all[:place]:
-                both = one.shown.seen & other.shown.seen
-                if both.any():
-                    apart = one.shown.value[both] - other.shown.value[both]
-                    noise = one.shown.variance[both].mean() + other.shown.variance[both].mean()
-                    result.append((_rms(apart) ** 2, float(noise), self._movement(one, other)))
+        for one, other in itertools.combinations(self._all, 2):
+            both = one.shown.seen & other.shown.seen
+            if both.any():
+                apart = one.shown.value[both] - other.shown.value[both]
+                noise = one.shown.variance[both].mean() + other.shown.variance[both].mean()
+                moved = self._movement(one.expected.pressure - other.expected.pressure)
+                result.append((_rms(apart) ** 2, float(noise), moved))
         return result
 
 
