@@ -66,10 +66,11 @@ class Unknowns:
         return np.asarray(near < 1e-3 * (self.high - self.low))
 
 
+@dataclass(frozen=True)
 class LeastSquares:
     """One fit.
 
-    Args:
+    Attributes:
         unknowns: what is free, and what is known of it.
         rows: gives the data's weighted residuals and their derivatives; None for values that the
             model cannot follow.
@@ -78,17 +79,10 @@ class LeastSquares:
             large as the unknowns' scales say, not their derivatives, and sees each row.
     """
 
-    def __init__(
-        self,
-        unknowns: Unknowns,
-        rows: Callable[[Array], Rows | None],
-        softness: float | None = None,
-        *,
-        cheap: bool = False,
-    ) -> None:
-        self.unknowns = unknowns
-        self._cheap = cheap
-        self._rows, self._softness = rows, softness
+    unknowns: Unknowns
+    rows: Callable[[Array], Rows | None]
+    softness: float | None = None
+    cheap: bool = False
 
     def follows(self, values: Array) -> bool:
         """Return whether the model follows with values (P,)."""
@@ -106,7 +100,7 @@ class LeastSquares:
         """
         unknowns = self.unknowns
         begin = unknowns.inside(unknowns.prior if start is None else start)
-        rows = self._all_rows if self._cheap else self._summed
+        rows = self._all_rows if self.cheap else self._summed
 
         def residual(x: Array) -> Array:
             return rows(x * unknowns.scale)[0]
@@ -114,7 +108,7 @@ class LeastSquares:
         def jacobian(x: Array) -> Array:
             return rows(x * unknowns.scale)[1]()
 
-        tolerance *= 1e-4 if self._cheap else 1.0
+        tolerance *= 1e-4 if self.cheap else 1.0
         # The matrices are too small for more threads, which would wait for each other.
         with _THREADS.limit(limits=1, user_api="blas"):
             solution = least_squares(
@@ -122,12 +116,12 @@ class LeastSquares:
                 begin / unknowns.scale,
                 jac=jacobian,
                 bounds=(unknowns.low / unknowns.scale, unknowns.high / unknowns.scale),
-                loss="soft_l1" if self._cheap and self._softness else "linear",
-                f_scale=self._softness or 1.0,
-                x_scale=1.0 if self._cheap else "jac",
+                loss="soft_l1" if self.cheap and self.softness else "linear",
+                f_scale=self.softness or 1.0,
+                x_scale=1.0 if self.cheap else "jac",
                 xtol=10.0 * tolerance,
                 ftol=tolerance,
-                max_nfev=10 * MOST_EVALUATIONS if self._cheap else MOST_EVALUATIONS,
+                max_nfev=10 * MOST_EVALUATIONS if self.cheap else MOST_EVALUATIONS,
             )
         return np.asarray(solution.x * unknowns.scale)
 
@@ -136,7 +130,7 @@ class LeastSquares:
 
         Rows that the model cannot follow are NaN, which drives the search to a shorter step.
         """
-        unknowns, known, found = self.unknowns, self.unknowns.known, self._rows(values)
+        unknowns, known, found = self.unknowns, self.unknowns.known, self.rows(values)
         residual = np.full(1, np.nan) if found is None else found[0]
         prior = ((values - unknowns.prior) / unknowns.spread)[known]
 
@@ -155,9 +149,9 @@ class LeastSquares:
         """
         residual, slopes = self._all_rows(values)
         growth, total = np.ones(len(residual)), float(residual @ residual)
-        if self._softness is not None:
-            growth = np.sqrt(1.0 + (residual / self._softness) ** 2)
-            total = 2.0 * self._softness**2 * float(np.sum(growth - 1.0))
+        if self.softness is not None:
+            growth = np.sqrt(1.0 + (residual / self.softness) ** 2)
+            total = 2.0 * self.softness**2 * float(np.sum(growth - 1.0))
         root = math.sqrt(total)
 
         def summed() -> Array:
@@ -177,7 +171,7 @@ class LeastSquares:
             factor: by which the data's variance is larger than their weights say.
         """
         unknowns = self.unknowns
-        found = self._rows(values)
+        found = self.rows(values)
         assert found is not None
         slopes = found[1]() * unknowns.scale
         prior = np.where(unknowns.known, unknowns.scale / unknowns.spread, 0.0)

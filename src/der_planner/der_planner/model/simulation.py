@@ -48,10 +48,11 @@ class Initial(NamedTuple):
 AT_REST = Initial()
 
 
+@dataclass(frozen=True)
 class Derivative:
     """First-order change of tip and bend angles along one simulated motion of n intervals.
 
-    Args:
+    Attributes:
         linear: of the model by its effective pressures.
         felt: takes a change (K, M) of the commands or pressures to those of the effective pressures
             (n, S, M), and of the first ones (M,) [Pa].
@@ -60,15 +61,10 @@ class Derivative:
         steps: S.
     """
 
-    def __init__(
-        self,
-        linear: FirstOrder,
-        felt: Callable[[Array], tuple[Array, Array]],
-        start_slope: Array | None,
-        steps: int,
-    ) -> None:
-        self._linear, self._felt, self._start_slope = linear, felt, start_slope
-        self._steps = steps
+    linear: FirstOrder
+    felt: Callable[[Array], tuple[Array, Array]]
+    start_slope: Array | None
+    steps: int
 
     def tangent(self, change: ArrayLike) -> tuple[Array, Array]:
         """Return the changes of tip (n+1, 2) [m] and bend angles (n+1, M) [rad].
@@ -76,18 +72,18 @@ class Derivative:
         Args:
             change: (K, M) of the commands or pressures [Pa].
         """
-        return self._bent(*self._felt(np.asarray(change, dtype=float)))
+        return self._bent(*self.felt(np.asarray(change, dtype=float)))
 
     def by_effective(self, change: Array) -> tuple[Array, Array]:
         """Return the same for C changes (n+1, M, C) of the effective pressures at boundaries [Pa].
 
         Each interval changes by the mean of both ends, the start by the first row.
         """
-        return self._bent(means_between(change, self._steps), change[0])
+        return self._bent(means_between(change, self.steps), change[0])
 
     def _bent(self, effective: Array, first: Array) -> tuple[Array, Array]:
-        slope = self._start_slope
-        return self._linear.tangent(effective, None if slope is None else slope @ first)
+        slope = self.start_slope
+        return self.linear.tangent(effective, None if slope is None else slope @ first)
 
 
 @dataclass(frozen=True)
