@@ -54,10 +54,8 @@ def compliance(model: RodModel, bend_angles: ArrayLike, places: ArrayLike) -> Co
     sweep, tip_sweep = _turned(arms), _turned(nodes[-1] - joints)
     slack = 1.0 / joint_stiffness(model, angles)
     turns = slack[:, None] * sweep
-    first = [segment for segment, _ in rod.segments]
     bends = np.diff(even.turning, axis=0, prepend=0.0) > 0.0
-    couple = rod.input_gain * rod.rest_lengths[first]
-    pressed = slack[:, None] * bends * couple
+    pressed = slack[:, None] * bends * model.balance.moment_gain
     # A bend angle is the heading of the edge at a segment's end, less that before the segment.
     ends = np.array(end_edges(rod))[:, None]
     before = (np.arange(len(joints)) <= ends).astype(float)

@@ -137,13 +137,16 @@ class Balance:
     Args:
         rod: planar, with ghost clamp.
         kinematics: of its evenly bent segments.
+
+    Attributes:
+        moment_gain: (M,) moment of the couples of each segment per pressure [N·m/Pa].
     """
 
     def __init__(self, rod: Rod, kinematics: PolylineKinematics) -> None:
         self.rod = rod
         self.kinematics = kinematics
         first = [first for first, _ in rod.segments]
-        self._moment_gain = rod.input_gain * rod.rest_lengths[first]
+        self.moment_gain = rod.input_gain * rod.rest_lengths[first]
 
     def projected(self, q: Array, v: Array, a: Array) -> Array:
         """Return (K, M) pressures [Pa] from Sᵀ (M q̈ + D q̇ − F_int − F_ext) = Sᵀ B Λ u.
@@ -156,7 +159,7 @@ class Balance:
         force = self._needed_force(q, v, a)
         load = np.einsum("kmna,kna->km", self.kinematics.tangents(q), force)
         # A couple on an edge works on that edge's turning: Sᵀ B Λ = diag(Λ times edge length).
-        pressures: Array = load / self._moment_gain
+        pressures: Array = load / self.moment_gain
         return pressures
 
     def paper(self, q: Array, v: Array, a: Array) -> tuple[Array, Array]:
@@ -214,7 +217,7 @@ class Balance:
         for j, (first, count) in enumerate(self.rod.segments):
             for edge, sign in ((first, -1.0), (first + count - 2, 1.0)):
                 # A couple about z on an edge: −n̂/|ē| times itself behind, +n̂/|ē| ahead.
-                pair = sign * self._moment_gain[j] * normal[:, edge] / rest[edge]
+                pair = sign * self.moment_gain[j] * normal[:, edge] / rest[edge]
                 matrix[:, edge, :, j] -= pair
                 matrix[:, edge + 1, :, j] += pair
         return matrix[:, 1:].reshape(len(q), -1, self.rod.segment_count)
