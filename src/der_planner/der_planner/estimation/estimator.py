@@ -282,21 +282,16 @@ class Estimator:
     def _run(self, last: int) -> None:
         if last <= self._last:
             return
-        differential = self.chambers.during(np.arange(self._last, last))
-        begin = self._last
-        for first in range(begin, last):
-            # What friction and creep take changes once a control period.
-            if first > begin and first % STEPS:
-                continue
-            end = min(last, (first // STEPS + 1) * STEPS)
-            self._period(first, differential[first - begin : end - begin])
+        steps = np.arange(self._last, last)
+        differential = self.chambers.during(steps)
+        # What friction and creep take changes once a control period.
+        begins = np.flatnonzero((steps % STEPS == 0) | (steps == self._last))
+        for first, held in zip(steps[begins], np.split(differential, begins[1:]), strict=True):
+            self._period(int(first), held)
         self._last = last
-        oldest = last - self._kept
-        for j in list(self._known):
-            if j >= oldest:
-                break
-            del self._known[j]
-            self._measurements.pop(j, None)
+        while self._oldest < last - self._kept:
+            self._measurements.pop(self._oldest, None)
+            del self._known[self._oldest]
 
     def _updated(self, j: int, known: Knowledge) -> Knowledge:
         for entry in self._measurements.get(j, ()):
