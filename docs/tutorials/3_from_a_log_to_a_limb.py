@@ -11,7 +11,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from der_planner.identification import check, fit, predict, record_twin
-from der_planner.identification.excitation import PERIOD, Excitation, calibration_run, waves
+from der_planner.identification.excitation import Excitation, calibration_run, waves
 from der_planner.limb import Limb
 from der_planner.model import Model
 
@@ -44,7 +44,7 @@ for name in ("gain[0]", "gain[1]", "friction_pressure[0]", "friction_pressure[1]
 # for its whole length. Another run of the same limb begins with other rest angles.
 
 pressure = waves(0.5 * prior.pneumatics.pressure_limit, prior.segment_count, 30.0)
-later = record_twin(SEED, Excitation(PERIOD * np.arange(len(pressure)), pressure), run=7)
+later = record_twin(SEED, Excitation(pressure), run=7)
 even = later.resampled(0.05)
 known = predict(limb, even.time, even.measured_differential)
 before = predict(prior, even.time, even.measured_differential)

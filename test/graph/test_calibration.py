@@ -15,7 +15,7 @@ from limbs import with_segments
 from der_planner.bags.reader import BagReader
 from der_planner.commands import calibrate_limb
 from der_planner.identification import read_bag
-from der_planner.identification.excitation import PERIOD, Excitation, waves, write_excitation
+from der_planner.identification.excitation import Excitation, waves, write_excitation
 from der_planner.limb import Limb
 
 SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "calibrate_limb.py"
@@ -30,7 +30,7 @@ def test_a_rig_is_calibrated_as_its_twin_is_in_one_process(
     rest = np.zeros((20, 2))
     pressure = np.concatenate([rest, waves(12_000.0, 2, 12.0), rest])
     table = tmp_path / "excitation.csv"
-    write_excitation(Excitation(PERIOD * np.arange(len(pressure)), pressure), table)
+    write_excitation(Excitation(pressure), table)
     # A first guess far from the twin, so that only the data can bring both files together.
     guess = Limb.default()
     wrong = with_segments(guess, moment_gain=lambda s: 1.6 * s.moment_gain)

@@ -178,7 +178,7 @@ def test_each_log_finds_its_own_rest_even_if_it_is_not_exactly_zero(tmp_path, re
 
 def test_an_excitation_is_written_into_a_new_folder_and_read_back(tmp_path):
     pressure = np.array([[0.0, 1.5], [-2000.25, 7e3]])
-    write_excitation(Excitation(np.array([0.0, 0.05]), pressure), tmp_path / "new" / "table.csv")
+    write_excitation(Excitation(pressure), tmp_path / "new" / "table.csv")
     read = read_excitation(tmp_path / "new" / "table.csv", 2)
     np.testing.assert_array_equal(read.differential_pressure, pressure)
 

@@ -32,7 +32,7 @@ def test_twin_is_predicted_after_one_calibration(calibrated):
     assert np.degrees(report.residual).max() < 1.0
     time = np.arange(0, 30, PERIOD)
     pressure = 9000.0 * np.stack([1 - np.cos(time / 3), np.sin(time / 2)], axis=1)
-    log = record_twin(SEED, Excitation(time, pressure), run=2)
+    log = record_twin(SEED, Excitation(pressure), run=2)
     predicted = predict(limb, log.time, log.measured_differential)
     error = np.linalg.norm(predicted.tip - log.tip, axis=1) / limb.length
     assert error.mean() < 0.03

@@ -34,30 +34,32 @@ AMPLITUDE = 0.7
 
 @dataclass(frozen=True)
 class Excitation:
-    """A timed sequence of differential pressures.
+    """A sequence of differential pressures, 50 ms apart.
 
     Attributes:
-        time: (K,) [s].
         differential_pressure: (K, M) [Pa].
         name: of what it is for; the plan's id begins with it.
         prompts: what an operator is to do, by the index of the setpoint with which it is said.
     """
 
-    time: Array
     differential_pressure: Array
     name: str = "calibration"
     prompts: Mapping[int, str] = field(default_factory=dict)
 
     @property
+    def time(self) -> Array:
+        """(K,) instants of the pressures [s]."""
+        return PERIOD * np.arange(len(self.differential_pressure), dtype=float)
+
+    @property
     def duration(self) -> float:
         """Length of the run [s]."""
-        return float(self.time[-1] + PERIOD)
+        return PERIOD * len(self.differential_pressure)
 
     def with_rest(self, duration: float) -> Excitation:
         """Return the run with a rest without pressure after it [s]."""
         rows = np.zeros((round(duration / PERIOD), self.differential_pressure.shape[1]))
-        pressure = np.concatenate([self.differential_pressure, rows])
-        return Excitation(PERIOD * np.arange(len(pressure), dtype=float), pressure)
+        return Excitation(np.concatenate([self.differential_pressure, rows]))
 
 
 def write_excitation(excitation: Excitation, path: Path) -> None:
@@ -89,7 +91,7 @@ def read_excitation(path: Path, segment_count: int) -> Excitation:
             f"the excitation {path}: times must be 0, {PERIOD}, {2 * PERIOD} … s, and all numbers "
             "finite"
         )
-    return Excitation(table[:, 0], table[:, 1:])
+    return Excitation(table[:, 1:])
 
 
 def within_limits(excitation: Excitation, pressure_limit: float, slew_limit: float) -> Excitation:
@@ -178,7 +180,7 @@ def calibration_run(amplitude: float, segment_count: int = 2, quick: bool = Fals
             pause,
         ]
     )
-    return Excitation(PERIOD * np.arange(len(pressure), dtype=float), pressure)
+    return Excitation(pressure)
 
 
 def _fade(wave: Array, duration: float) -> Array:

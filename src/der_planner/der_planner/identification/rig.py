@@ -171,8 +171,7 @@ def check_run(segment_count: int, pressure: float) -> Excitation:
         fill = np.zeros((held + vented, segment_count))
         fill[:held, valve // 2] = pressure * (1 - 2 * (valve % 2))
         rows.append(fill)
-    table = np.concatenate(rows)
-    return Excitation(CONTROL_PERIOD * np.arange(len(table), dtype=np.float64), table, "check")
+    return Excitation(np.concatenate(rows), "check")
 
 
 def find_rig(log: RigLog) -> RigFinding:

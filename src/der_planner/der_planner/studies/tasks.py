@@ -280,7 +280,7 @@ def unseen_motion() -> Excitation:
     """Return pressures that no calibration has played."""
     instants = np.arange(0.0, 40.0, CONTROL_PERIOD)
     waves = [1.0 - np.cos(instants / 3.0), np.sin(instants / 2.0)]
-    return Excitation(instants, 9000.0 * np.stack(waves, axis=1))
+    return Excitation(9000.0 * np.stack(waves, axis=1))
 
 
 def _identify(limb: str, row: Mapping[str, Any]) -> Result:
