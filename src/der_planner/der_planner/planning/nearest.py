@@ -127,7 +127,8 @@ def nearest_path(
     time, drawn = _sampled(path, samples)
     step = float(time[1])
     wave = TIMED_WAVE if limits is None else DRAWN_WAVE / PACE
-    target = _smoothed(drawn.mean(axis=1) - offset, step, wave)
+    wanted = drawn.mean(axis=1)
+    target = _smoothed(wanted - offset, step, wave)
     angles = _Search(workspace, target, step).run()
     # Without overshoot where the course hurries along a limit; what is left of corners goes after.
     course = PchipInterpolator(time, angles)
@@ -137,12 +138,15 @@ def nearest_path(
         along = np.concatenate([still, along, still + path.duration])
         clock = np.arange(len(along)) * clock[1]
     followed = _smoothed(course(along), float(clock[1]), TIMED_WAVE)
-    slowed = math.nan if limits is not None else float(clock[-1] / path.duration)
-    deviation = _deviation(
-        drawn.mean(axis=1),
-        workspace.arcs.tip(angles) + offset,
-        np.interp(time, along, clock),
-        slowed,
+    distance = np.linalg.norm(wanted - workspace.arcs.tip(angles) - offset, axis=-1)
+    farthest = int(distance.argmax())
+    deviation = Deviation(
+        largest=float(distance[farthest]),
+        mean=float(distance.mean()),
+        time=float(np.interp(time[farthest], along, clock)),
+        point=wanted[farthest],
+        share=float((distance >= NOTABLE).mean()),
+        slowed=math.nan if limits is not None else float(clock[-1] / path.duration),
     )
     return clock, followed, deviation
 
@@ -301,17 +305,3 @@ class _Search:
         blocks = np.concatenate([self._kinematics.tip_jacobians(angles), by_angle], axis=1)
         near = sparse.bsr_array((blocks, np.arange(count), np.arange(count + 1)))
         return sparse.csr_array(sparse.vstack([near, self._smoothing]))
-
-
-def _deviation(drawn: Array, tip: Array, when: Array, slowed: float) -> Deviation:
-    """Compare tips (K, 2) with the drawn path, both evenly spaced along it."""
-    distance = np.linalg.norm(drawn - tip, axis=-1)
-    farthest = int(distance.argmax())
-    return Deviation(
-        largest=float(distance[farthest]),
-        mean=float(distance.mean()),
-        time=float(when[farthest]),
-        point=drawn[farthest],
-        share=float((distance >= NOTABLE).mean()),
-        slowed=slowed,
-    )
