@@ -32,17 +32,11 @@ def end_edges(rod: Rod) -> list[int]:
 def bend_angles(rod: Rod, q: Array) -> Array:
     """Return the bend angles (…, K, M) [rad] of configurations in time (…, K, 4N-1).
 
-    One configuration (4N-1,) gives (M,). See `angles_of_outputs` for limbs that are rolled up.
+    One configuration (4N-1,) gives (M,). A heading is known up to whole turns. In the first row
+    each segment is taken to bend by less than half a turn; from row to row headings change by less
+    than half a turn.
     """
-    return angles_of_outputs(q[..., bend_outputs(rod)])
-
-
-def angles_of_outputs(outputs: Array) -> Array:
-    """Return the bend angles (…, K, M) [rad] of the coordinates `bend_outputs` (…, K, 4M).
-
-    A heading is known up to whole turns. In the first row each segment is taken to bend by less
-    than half a turn; from row to row headings change by less than half a turn.
-    """
+    outputs = q[..., bend_outputs(rod)]
     dx = outputs[..., 2::4] - outputs[..., 0::4]
     dy = outputs[..., 3::4] - outputs[..., 1::4]
     headings = np.unwrap(np.arctan2(dy, dx), axis=-1)
