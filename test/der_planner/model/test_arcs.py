@@ -38,7 +38,7 @@ def model(request):
 
 def configurations(model, count=5, scale=1.2):
     rng = np.random.default_rng(SEED)
-    return rng.normal(scale=scale, size=(count, 2, model.segment_count))
+    return rng.normal(scale=scale, size=(count, 2, model.inputs))
 
 
 def material_points(model, q, points=4001):
@@ -111,7 +111,7 @@ def test_tip_and_its_jacobian_agree(model):
 
 def rolled(model, pressures, step, angles=None, rates=None):
     """Angles and rates (K+1, n) from a given state, else straight, by the kernel itself."""
-    still = np.zeros(model.segment_count)
+    still = np.zeros(model.inputs)
     q, v = (still if given is None else given for given in (angles, rates))
     return kernels.simulate(q, v, pressures, step, model.arcs, False)[:2]
 
@@ -134,7 +134,7 @@ def test_undamped_motion_keeps_its_energy(count):
 
 def test_pressures_invert_the_forward_dynamics(model):
     rng = np.random.default_rng(SEED)
-    q, v, a = rng.normal(size=(3, 6, model.segment_count))
+    q, v, a = rng.normal(size=(3, 6, model.inputs))
     pressures = model.inverse_dynamics(q, v, a)
     for k in range(len(q)):
         _, rates = rolled(model, pressures[k][None, None], 1e-9, q[k], v[k])

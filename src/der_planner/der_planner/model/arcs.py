@@ -86,7 +86,6 @@ class ArcModel(Model):
     def __init__(self, limb: Limb, nodes: int = NODES) -> None:
         super().__init__(limb, nodes)
         segments = limb.segments
-        self.segment_count = limb.segment_count
         self.lengths = np.array([s.length for s in segments])
         self.base = float(limb.base_length)
         self.connector = float(limb.connector_length)
@@ -94,7 +93,6 @@ class ArcModel(Model):
         self.stiffness = np.array([s.bending_stiffness / s.length for s in segments])
         self.cubic = np.array([s.cubic_stiffness / s.length**3 for s in segments])
         self.free_angles = np.array([s.rest_curvature * s.length for s in segments])
-        self.material_damping = np.array([s.material_damping for s in segments])
         self.gain = np.array([s.moment_gain for s in segments])
         self.arcs = self._arcs()
         self.kinematics = self
@@ -126,13 +124,14 @@ class ArcModel(Model):
         return Arcs(
             self.lengths, self.connector, np.array(self.limb.gravity[:2], dtype=float),
             owner.astype(np.int64), place, beyond, masses, pulled, drag, self.gain,
-            self.stiffness, self.cubic, self.free_angles, self.material_damping,
+            self.stiffness, self.cubic, self.free_angles,
+            np.array([s.material_damping for s in self.limb.segments]),
         )  # fmt: skip
 
     def _place(self, arc_length: float) -> tuple[int, float, float]:
         """Return segment, fraction of it and distance past its end [m] of a place on the limb."""
         left, spans = arc_length - self.base, self.lengths + self.connector
-        last = self.segment_count - 1
+        last = self.inputs - 1
         j = min(int(np.searchsorted(np.cumsum(spans), left)), last)
         inside = left - spans[:j].sum()
         past = 0.0 if j == last else max(inside - self.lengths[j], 0.0)
@@ -140,9 +139,9 @@ class ArcModel(Model):
 
     def _check(self, name: str, value: ArrayLike) -> Array:
         array = np.asarray(value, dtype=float)
-        if array.shape != (self.segment_count,) or not np.all(np.isfinite(array)):
+        if array.shape != (self.inputs,) or not np.all(np.isfinite(array)):
             raise ValueError(
-                f"{name} must be {self.segment_count} finite numbers, one a segment, got {value!r}"
+                f"{name} must be {self.inputs} finite numbers, one a segment, got {value!r}"
             )
         return array
 
@@ -196,7 +195,7 @@ class ArcModel(Model):
         which the energy falls: beyond the load that buckles the straight limb, a bent one is found.
         """
         drive = self.gain * self._check("pressures", effective)
-        still = np.zeros(self.segment_count)
+        still = np.zeros(self.inputs)
         q: Array = self.free_angles + drive / self.stiffness
         for _ in range(_RESTING_STEPS):
             pull = drive - kernels.needed_torque(q, still, still, self.arcs)
@@ -252,8 +251,8 @@ class ArcModel(Model):
         if not isinstance(start, ArcState):
             raise TypeError("the arcs start from a state of the arcs, got one of the rod")
         inputs = np.ascontiguousarray(effective, dtype=float)
-        if inputs.ndim != 3 or inputs.shape[2] != self.segment_count:
-            raise ValueError(f"pressures must be (K, S, {self.segment_count}), got {inputs.shape}")
+        if inputs.ndim != 3 or inputs.shape[2] != self.inputs:
+            raise ValueError(f"pressures must be (K, S, {self.inputs}), got {inputs.shape}")
         step, linear = period / inputs.shape[1], None
         angles, rates, by_state, by_pressure = kernels.simulate(
             start.angles, start.rates, inputs, step, self.arcs, bool(linearise)
