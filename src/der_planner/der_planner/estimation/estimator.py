@@ -68,7 +68,7 @@ _STRANGE = 6.0
 _STRANGEST = 200.0
 """Largest squared distance per coordinate with which one picture counts in their smoothed value."""
 _EVENT = (0.0, 0.5, 0.042, 0.05, 0.0, 0.0)
-"""What an event adds to the deviation of δθ, δθ̇ [rad/s], d [Pa], g, b and log s."""
+"""What an event adds to the deviation of δθ, δθ̇ [rad/s], d, g, b and log s, as in `_FIRST`."""
 
 
 @dataclass(frozen=True)

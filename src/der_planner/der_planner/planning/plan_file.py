@@ -121,7 +121,7 @@ class Plan:
 
     @property
     def slew_margin(self) -> float:
-        """What is left to the slew limit at the fastest change, the first from rest [Pa/s]."""
+        """What is left to the slew limit at the fastest change from setpoint to setpoint [Pa/s]."""
         steps = np.diff(self.differential_pressure, axis=0)
         fastest = float(np.abs(steps).max(initial=0.0)) / float(self.time[1] - self.time[0])
         return self.limb.pneumatics.slew_limit - fastest

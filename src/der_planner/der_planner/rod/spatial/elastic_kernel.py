@@ -1,9 +1,8 @@
 """Compiled kernels of a rod in space: four unknowns a node, half-bandwidth 10.
 
 Symbols: n nodes (with the ghost node, if any), x (4n-1,) = x0, φ0, x1, …; edge j = x_{j+1} − x_j
-with
-tangent t; d̂, t̂ the reference director and tangent of the last converged step, d1 = P(t̂→t) d̂ the
-director now, m1, m2 the material frame at φ; at node i κb = 2 t_e×t_f / χ, χ = 1 + t_e·t_f, and
+with tangent t; d̂, t̂ the reference director and tangent of the last converged step, d1 = P(t̂→t) d̂
+the director now, m1, m2 the material frame at φ; at node i κb = 2 t_e×t_f / χ, χ = 1 + t_e·t_f, and
 
     κ1 = ½ κb·(m2e + m2f),  κ2 = −½ κb·(m1e + m1f),  τ = φf − φe + reference twist
 
