@@ -215,13 +215,6 @@ def test_another_motion_takes_over_without_a_jump(planned):
     assert np.mean(errors) < 0.025 * LENGTH
 
 
-def test_a_motion_that_takes_over_sends_the_same_share_of_corrections(planned):
-    first, second = Feedback(planned), Feedback(planned)
-    first._benefit.share, first._supervisor.share = 0.5, 0.8
-    second.take_over(first, 0.0)
-    assert second.share == first.share == 0.4
-
-
 def test_the_next_run_remembers_what_corrections_bring_once_it_has_left_its_rest(
     planned, corrected
 ):
