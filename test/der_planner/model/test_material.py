@@ -112,14 +112,6 @@ def test_too_much_stiffening_is_refused_by_its_name():
         Material(limb).differential_pressure(TIME, WANTED, BEND)
 
 
-def test_limb_file_keeps_everything(tmp_path):
-    limb = rubbing()
-    limb = replace(limb, pcc_segments=tuple(replace(s, damping=2.0) for s in limb.segments))
-    limb.to_yaml(tmp_path / "limb.yaml")
-    assert Limb.from_yaml(tmp_path / "limb.yaml") == limb
-    assert limb.for_model("pcc").segments == limb.pcc_segments
-
-
 LIMB = replace(Limb.default(), connector_length=0.0, base_length=0.0)
 LENGTH = LIMB.length
 EI = LIMB.segments[0].bending_stiffness
