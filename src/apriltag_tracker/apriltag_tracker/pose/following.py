@@ -104,9 +104,7 @@ class LimbFollower:
         if estimate is None:
             cause = f"no limb {self._noun} {self._place}"
             if seen:
-                cause = (
-                    f"limb {self._noun}s contradict each other: check places, turns, units"
-                )
+                cause = f"limb {self._noun}s contradict each other: check places, turns, units"
             elif unfit:
                 cause = f"{unfit} limb {self._noun}(s) do not fit the map: check size and height"
             return self._bridge(stamp, cause)

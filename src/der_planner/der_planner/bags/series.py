@@ -115,8 +115,8 @@ def run_of(record: BagRecord, namespace: str, plan_id: str = "") -> RunSeries:
         )
     about = _describe(plan, record, namespace, feedback)
     # Planners of other people need not predict anything.
-    told = getattr(plan, "tip_predicted", ())
-    predicted = np.array(told).reshape(-1, 2) if len(told) else None
+    foreseen = getattr(plan, "tip_predicted", ())
+    predicted = np.array(foreseen).reshape(-1, 2) if len(foreseen) else None
     wanted = np.array(plan.tip_reference).reshape(-1, 2)
     return RunSeries(
         description=about,

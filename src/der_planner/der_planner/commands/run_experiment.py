@@ -14,12 +14,14 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import fcntl
 import hashlib
 import json
 import platform
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -127,14 +129,34 @@ def run(options: Options, progress: Progress | None = None) -> None:
     progress.say(
         f"{len(left)} of {len(trials)} trials to play on {_stage(options)}, into {options.out}"
     )
-    for place, trial in enumerate(trials, start=1):
-        if trial in left:
-            progress.say(
-                f"[{place}/{len(trials)}] {trial.motion}, {trial.model} {trial.manner}, "
-                f"trial {trial.number} (seed {trial.seed})"
-            )
-            _play_trial(trial, options, ledger, progress)
-    _conclude(options, [each for trial in trials for each in ledger.runs_of(trial)], progress)
+    with _alone_in(options.out):
+        for place, trial in enumerate(trials, start=1):
+            if trial in left:
+                progress.say(
+                    f"[{place}/{len(trials)}] {trial.motion}, {trial.model} {trial.manner}, "
+                    f"trial {trial.number} (seed {trial.seed})"
+                )
+                _play_trial(trial, options, ledger, progress)
+        _conclude(options, [each for trial in trials for each in ledger.runs_of(trial)], progress)
+
+
+@contextlib.contextmanager
+def _alone_in(folder: Path) -> Iterator[None]:
+    """Keep other experiments out of a folder.
+
+    Raises:
+        OptionError: one is in it.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / ".lock").open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise OptionError(
+                f"--out {folder} is in use by another experiment: wait for its end, or choose "
+                "another folder"
+            ) from error
+        yield
 
 
 class Ledger:
@@ -359,13 +381,13 @@ def _conclude(options: Options, kept: Kept, progress: Progress) -> None:
     progress.say("evaluating")
     runs = [_load(options.out, trial, entry) for trial, entry in kept]
     found = [evaluate_run(run) for run in runs]
-    path = write_results(found, options.out)
+    written = {"results": write_results(found, options.out)}
+    if options.report:
+        written["figures and report"] = write_report(runs, found, options.out / "report")
     print(format_table(summarise(found), compare(found)))
     _print_instruments(found, kept)
-    progress.say(f"results: {path}")
-    if options.report:
-        folder = options.out / "report"
-        progress.say(f"figures and report: {write_report(runs, found, folder)}")
+    for what, path in written.items():
+        progress.say(f"{what}: {path}")
 
 
 def _load(folder: Path, trial: Trial, entry: dict[str, Any]) -> RunSeries:

@@ -8,6 +8,7 @@ straight lines fitted in a Gaussian neighbourhood, with the tracker's covariance
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,6 +41,10 @@ _NOT_THESE = 0.5
 """Error of the chambers, over what they hold, from which on they are not those of the run."""
 _USUAL_ERROR = 1.5
 """Multiple of the median error up to which a limb still followed."""
+_MOST_LATE, _LATE = 40, 4
+"""Setpoints by which a tip is looked for to be later or earlier, and from which on it is said."""
+_LATE_SHARE = 0.1
+"""Share of a tip's squared error that may be left without this time, if the time is wrong."""
 _LEAST_CORRELATION = 0.5
 """Correlation of measured and expected tip of a limb that moves with its commands."""
 _LEAST_MOVEMENT = 0.15
@@ -250,6 +255,25 @@ def moves_with(tip: Array, expected: Array) -> str:
     if alike < _LEAST_CORRELATION:
         return f"the tip does not move with the commands (correlation {alike:.2f})"
     return ""
+
+
+def later(tip: Array, expected: Array) -> int:
+    """Return by how many setpoints a tip is later than the model's, if that is most of its error.
+
+    A slower limb, or one with friction, comes late too, but little of its error is that alone.
+
+    Args:
+        tip: (K, 2), NaN where unseen [m].
+        expected: (K, 2) tip of the model under the commands [m].
+    """
+    left: dict[int, float] = {}
+    for lag in range(-_MOST_LATE, _MOST_LATE + 1):
+        end = len(tip) - abs(lag)
+        apart = tip[max(lag, 0) :][:end] - expected[max(-lag, 0) :][:end]
+        apart = apart[np.isfinite(apart).all(axis=1)]
+        left[lag] = movement(apart) if len(apart) > end // 2 else math.inf
+    best = min(left, key=lambda lag: left[lag])
+    return best if abs(best) >= _LATE and left[best] < _LATE_SHARE * left[0] else 0
 
 
 def movement(tip: Array) -> float:

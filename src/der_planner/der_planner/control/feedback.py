@@ -173,7 +173,11 @@ class Feedback:
             ValueError: another shape, or no time of the plan, or the covariance is none.
         """
         self._check(time)
-        self._estimator.measure(time, bend_angle, tip, covariance)
+        limb, angles, place = self.plan.limb, np.asarray(bend_angle), np.asarray(tip)
+        # Of another unit, or nothing: not seen.
+        angles = np.where(impossible(limb, "bend angles", angles), np.nan, angles)
+        place = np.where(impossible(limb, "tips", place), np.nan, place)
+        self._estimator.measure(time, angles, place, covariance)
 
     def command(self, time: float) -> Array:
         """Return the command (M,) [Pa] that takes effect at an instant [s] and holds for 50 ms.

@@ -35,6 +35,7 @@ from der_planner.control.disturbance import (
     chambers_beyond,
     disturbance,
     elsewhere,
+    later,
     movement,
     moves_with,
     stays_behind,
@@ -44,6 +45,7 @@ from der_planner.identification.update import adapted
 from der_planner.limb import Limb, LimbError
 from der_planner.limb.plausible import TOO_SMALL, impossible
 from der_planner.methods import LEARNED
+from der_planner.model import CONTROL_PERIOD
 from der_planner.planning.correction import PULL, Correction
 from der_planner.planning.loads import PlanningError
 from der_planner.planning.plan_file import Plan
@@ -281,6 +283,8 @@ class Learner:
             if follows or astray:
                 shown = Shown(np.where(kept[:, None], shown.value, np.nan), shown.variance, kept)
         astray = astray or moves_with(expected.tip + shown.value, expected.tip)
+        if not astray and (lag := later(tip, expected.tip)):
+            astray = f"its times are {lag * CONTROL_PERIOD:.2g} s later than those of the plan"
         inside = (measured.time >= plan.time[0]) & (measured.time <= plan.time[-1])
         wanted = interpolate(measured.time[inside], plan.time, plan.tip_reference)
         missed = np.linalg.norm(measured.tip[inside] - wanted, axis=1)

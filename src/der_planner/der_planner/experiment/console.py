@@ -6,6 +6,7 @@ import argparse
 import contextlib
 import functools
 import os
+import shutil
 import signal
 import sys
 import tempfile
@@ -56,7 +57,8 @@ class Progress:
         share = min(max(done / total, 0.0), 1.0) if total > 0 else 1.0
         line = f"  [{'#' * int(30 * share):<30}] {max(done, 0.0):5.0f} / {total:.0f} {unit} {text}"
         if self._terminal:
-            self._print(f"\r{line:<100}", end="")
+            width = shutil.get_terminal_size().columns - 1  # a wrapped line is not overwritten
+            self._print(f"\r{line[:width]:<{width}}", end="")
             self._open_line = True
             if finished:
                 self._end_bar()
@@ -131,7 +133,8 @@ def command(
             except KeyboardInterrupt as error:
                 ended = 130
                 said = f"stopped by {error or 'SIGINT'}{stopped and '; '}{stopped}"
-            print(said, file=sys.stderr)
+            with contextlib.suppress(OSError):  # the terminal may have gone
+                print(said, file=sys.stderr)
             return ended
 
         return main

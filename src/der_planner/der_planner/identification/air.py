@@ -95,6 +95,10 @@ def fit_air(log: CalibrationLog, prior: Pneumatics) -> AirFit:
     rest = measured[: vented.size][vented]
     offset = np.nanmean(rest, axis=0) if len(rest) else np.zeros(command.shape[1])
     offset = np.nan_to_num(offset)
+    if np.nanstd(measured - command) < 1e-6 * prior.pressure_limit:
+        raise LogError(
+            "the commands are the chambers' pressures themselves, and tell nothing of their lag"
+        )
     known = np.isfinite(measured) & (np.abs(measured - offset) > 0.0)
     limit = prior.pressure_limit
     smooth = known & _after_no_step(command, SMOOTH_RATE * limit)

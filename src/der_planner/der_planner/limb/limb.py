@@ -35,7 +35,7 @@ from der_planner.limb.parameters import CalibratedRange, Pneumatics, Segment
 SCHEMA_VERSION = 1
 MOST_CARRIED = 10.0
 """Largest payload over what the limb weighs: more is a mistake in the unit."""
-LEAST_BEND, MOST_BEND = 0.01, 100.0
+LEAST_BEND, MOST_BEND = 0.01, 15.0
 """Bend of a segment at the pressure limit that a limb can have [rad]."""
 SLOWEST = 60.0
 """Largest time in which chambers follow their command, or fill at the slew limit [s]."""

@@ -272,7 +272,7 @@ class DriverWatch:
         if begins and state.plan_id in begun:
             return Ending("vented", f"the driver vents the limb: {_REMEDY}")
         if begins and before in (PressureState.ARMED, PressureState.TRACKING):
-            return Ending("vented", f"the driver was told to vent: {_REMEDY}")
+            return Ending("vented", f"the driver was told to vent, or lost its operator: {_REMEDY}")
         stopped = self._mode in (PressureState.DISARMED, PressureState.FAULT)
         return self.obstacle() if stopped else None
 

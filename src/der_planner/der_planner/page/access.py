@@ -23,6 +23,8 @@ LOOPBACK_NAMES = ("127.0.0.1", "localhost", "::1")
 SAFE_METHODS = ("GET", "HEAD")
 KEPT = 15.0
 """The desk is kept for an operator whose browser is silent for this time [s]."""
+LOADED_ANEW = 1.0
+"""Silence of a window after which another of the same tab is the same window, loaded anew [s]."""
 HEADERS = (
     (b"x-frame-options", b"DENY"),
     (b"x-content-type-options", b"nosniff"),
@@ -198,7 +200,9 @@ class AccessFilter:
 
     def _exchange_token(self, request: HTTPConnection) -> Response:
         """Lead a browser to the address without the token, which it keeps in a cookie instead."""
-        answer = RedirectResponse(str(request.url.remove_query_params("token")), status_code=303)
+        url = request.url.remove_query_params("token")
+        # Without scheme and host, which are others before a reverse proxy.
+        answer = RedirectResponse(f"{url.path}{url.query and '?'}{url.query}", status_code=303)
         answer.set_cookie(self._cookie, self._token, httponly=True, samesite="lax")
         return answer
 
@@ -225,7 +229,8 @@ class Desk:
     """The place of the one window that commands the limb; all others watch.
 
     A window takes the desk if it is free, and loses it when it leaves, or when its browser has not
-    been heard for `KEPT`. A window that is loaded anew in its tab has another name and keeps it.
+    been heard for `KEPT`. A window that is loaded anew in its tab has another name and keeps it,
+    once the one before has been silent for `LOADED_ANEW`: a copy of the tab does not get it.
 
     Args:
         clock: steady [s].
@@ -259,11 +264,11 @@ class Desk:
 
     def hear(self, window: str, tab: str) -> None:
         """Note that a window's browser has answered just now, and the window's tab."""
-        if window not in self._tabs:
-            if self.operator is not None and self._tabs.get(self._holder) == tab:
-                self._holder = window
-            self._tabs[window] = tab
-        if window == self._holder:
+        self._tabs[window] = tab
+        same = self.operator is not None and self._tabs.get(self._holder) == tab
+        if same and self._age > LOADED_ANEW:
+            self._holder = window
+        if window == self.operator:
             self._heard = self._clock()
 
     def leave(self, window: str) -> None:

@@ -60,7 +60,8 @@ def create_app(parts: Parts) -> FastAPI:
     app = FastAPI(openapi_url=None, docs_url=None, redoc_url=None)
     app.mount("/static", StaticFiles(directory=STATIC))
     if parts.report is not None:
-        app.mount("/report", StaticFiles(directory=parts.report, check_dir=False))
+        parts.report.mkdir(parents=True, exist_ok=True)
+        app.mount("/report", StaticFiles(directory=parts.report))
     _add_live_data(app, parts)
     _add_picture(app, parts)
 
@@ -175,7 +176,7 @@ class PageServer:
                 server_header=False,
                 proxy_headers=False,
                 ws_ping_interval=1.0,
-                ws_ping_timeout=2.0,
+                ws_ping_timeout=5.0,
                 ws_per_message_deflate=False,  # it costs more time than it saves on a local network
                 timeout_graceful_shutdown=1,
                 lifespan="on",

@@ -108,7 +108,9 @@ const page = {
 
   setInterval(() => {
     // A connection that says nothing is given up, since a dead server's may stay open for minutes.
-    if (socket && seconds() - Math.max(heard, opened) > 3) { socket.close(); socket = null; }
+    // The first answer needs several ways there and back.
+    const patience = heard > opened ? 3 : 10;
+    if (socket && seconds() - Math.max(heard, opened) > patience) { socket.close(); socket = null; }
     if (!socket && seconds() - opened > 1) connect();
     watchSleep();
     show();
