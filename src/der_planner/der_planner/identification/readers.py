@@ -161,7 +161,7 @@ class ColumnMap:
     length_unit: str = _key(str, "unit of the tip: m, cm or mm", "m")
     tags: tuple[str, ...] = _key(_names, default=())
     angle_factor: float = _key(float, default=1.0)
-    rest_until: float | str = _key(_rest_until, default="auto")
+    rest_until: float | str = _key(_rest_until, default="")
     ignore: tuple[tuple[float, float], ...] = _key(_stretches, default=())
 
     @classmethod
@@ -292,13 +292,14 @@ def read_csv(path: str | Path, columns: ColumnMap) -> CalibrationLog:
         tip = columns.factor("length_unit") * pick(columns.tip)
     if columns.rest_until != 0:
         rest = _rest(time, command, columns.rest_until)
-        if not rest.any():
+        if columns.rest_until and not rest.any():
             raise LogError(
                 f"{path} has no row at rest: its commands never come within "
-                f"{100 * REST_SHARE:.0f} % of their largest to zero. Write rest_until: 0 into the "
+                f"{100 * REST_SHARE:.0f} % of their largest to zero. Leave rest_until out of the "
                 "column map if the chambers' sensors have no offset"
             )
-        measured = measured - np.nanmean(measured[rest], axis=0)
+        if rest.any():
+            measured = measured - np.nanmean(measured[rest], axis=0)
     if columns.tags:
         tags = pick(columns.tags)
         lost = np.all(np.diff(tags, axis=0, prepend=np.nan) == 0, axis=1)

@@ -210,8 +210,6 @@ def _problems(run: RunSeries, valid: float, longest: float) -> tuple[str, ...]:
         found.append(f"only {valid:.0%} of the images have a valid limb state")
     if longest > GAP:
         found.append(f"{longest:.1f} s without a valid limb state")
-    if not len(run.commanded) or not len(run.measured):
-        found.append("the chambers' pressures were not recorded: the driver may have faulted")
     if (others := _other_commands(run)) > 1.0 - LEAST_VALID:
         found.append(
             f"for {others:.0%} of the time the driver commanded other pressures: see its log"
