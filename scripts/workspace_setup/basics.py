@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -153,6 +154,8 @@ def environment() -> dict[str, str]:
     result.setdefault("RCUTILS_COLORIZED_OUTPUT", "0")
     profile = ROOT / "src" / "apriltag_tracker" / "config" / "fastdds_large_images.xml"
     result.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(profile))
+    if not os.access(result.get("HOME", ""), os.W_OK):  # ROS would not start without a log
+        result.setdefault("ROS_LOG_DIR", tempfile.gettempdir())
     result[INSIDE] = str(ROOT)
     return result
 
