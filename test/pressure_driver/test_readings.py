@@ -218,6 +218,25 @@ def test_reports_of_another_language_are_said_to_be_so(simulate):
     assert not sim.core.arm()[0]
 
 
+def test_a_board_of_which_nothing_is_understood_is_told_from_one_that_is_silent(simulate):
+    sim = simulate("ezloop")
+    telemetry = sim.board.telemetry
+    sim.board.telemetry = lambda: b""
+    sim.run(3.0)
+    assert "look at its power, its cable" in sim.core.obstacles()[0]
+    sim.board.telemetry = lambda: telemetry().replace(b"\n", b"\r")
+    sim.run(3.0)
+    assert "not of this language" in sim.core.obstacles()[0]
+
+
+def test_telemetry_that_ends_with_damaged_lines_shows_one(simulate):
+    sim = simulate("ezloop")
+    sim.arm()
+    sim.board.telemetry = lambda: b"[MPR]: 1013.2 ----- 1013.1 1013.3\n"
+    sim.run(2.0)
+    assert any("no telemetry" in text and "-----" in text for text in sim.core.obstacles())
+
+
 def test_reports_in_another_unit_are_said_to_be_implausible(simulate):
     sim = simulate("ezloop")
     sim.board.telemetry = lambda: b"[MPR]: 101.33 101.32 101.30 101.35\n[RPR]: 140.0\n"  # kPa

@@ -1,6 +1,7 @@
 """Order, times and choice of a replay."""
 
 import itertools
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -60,6 +61,14 @@ def test_what_commands_is_played_only_where_it_is_named(tmp_path: Path):
     assert {topic for _, topic, _ in play(bag)} == {"", "/limb/state"}
     named = play(bag, topics=["/limb/command"], remap={"/limb/command": "/old"})
     assert {topic for _, topic, _ in named} == {"", "/old"}
+
+
+def test_a_message_of_another_version_is_not_played_as_one_of_today(tmp_path: Path):
+    writer = BagWriter(tmp_path / "run")
+    older = replace(spec("/a", TEXT), definition="string before\n")
+    writer.write(older, START, START, string("a"))
+    with pytest.raises(BagError, match=f"another version of {TEXT} than is installed"):
+        play(writer.close())
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """Mistakes on command lines end with a sentence and an exit code, never with a traceback."""
 
+import fcntl
 import importlib
 import subprocess
 from dataclasses import replace
@@ -88,6 +89,13 @@ def test_a_limb_unlike_the_twin_does_not_play_on_it(call, tmp_path):
         replace(Limb.default(), segments=segments).to_yaml(file)
         found, _, said = call(run_experiment, "--dry-run", "--limb", str(file))
         assert (found, "the twin has 2 segments and 0.244 m" in said) == (1, True)
+
+
+def test_two_experiments_do_not_share_a_folder(call, tmp_path):
+    with (tmp_path / ".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        found, _, said = call(run_experiment, "--offline", "--out", str(tmp_path))
+    assert (found, "is in use by another experiment" in said) == (2, True)
 
 
 def test_pressures_beyond_the_limit_start_nothing(call, tmp_path):

@@ -325,6 +325,15 @@ def test_pushes_do_not_end_feedback_and_die_no_later(planned, corrected):
     assert swing(played, corrected[0]) <= swing(pushed(None), play(planned, Chain()))
 
 
+def test_tips_in_millimetres_and_bend_angles_in_degrees_count_as_not_seen(planned):
+    feedback = Feedback(planned)
+    for k, tip in enumerate(planned.tip_predicted[:60]):
+        feedback.measure(0.05 * k, np.rad2deg([0.5, 0.5]), 1e3 * tip)
+        feedback.command(0.05 * (k + 2))
+    np.testing.assert_allclose(feedback.estimate(3.0).tip, planned.tip_predicted[60], atol=1e-3)
+    assert feedback.share == 0.0
+
+
 def test_commands_that_are_asked_for_too_late_end_feedback(planned):
     feedback = Feedback(planned)
     for k in range(40):

@@ -296,9 +296,10 @@ def test_a_run_that_does_not_move_with_its_commands_is_refused(first):
         (lambda tip: tip[:, ::-1], "begins .* count from the clamp"),
         (lambda tip: 0.0 * tip, "begins .* count from the clamp"),
         (lambda tip: tip[0] + 0.0 * tip, "moved 0% of its way"),
+        (lambda tip: np.concatenate([tip[:1].repeat(8, axis=0), tip[:-8]]), "are 0.4 s later"),
     ],
 )
-def test_tips_that_are_swapped_or_stand_still_teach_nothing(first, turned, reason):
+def test_tips_that_are_swapped_or_late_or_stand_still_teach_nothing(first, turned, reason):
     learner = Learner(first)
     learner.add(first.time, turned(first.tip_predicted))
     assert not learner.history[0].accepted

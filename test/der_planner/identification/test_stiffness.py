@@ -151,6 +151,8 @@ def test_lag_of_the_air_is_recovered():
     )
     np.testing.assert_allclose(found.offset, 7.0, atol=3.0)
     assert "vent_rate" not in found.numbers, "no outlet held a chamber up"
+    with pytest.raises(LogError, match="tell nothing of their lag"):
+        fit_air(replace(log, commanded_differential=log.measured_differential + 7.0), AIR)
 
 
 @pytest.mark.parametrize(("rate", "exponent"), [(4200.0, 0.55), (5300.0, 2 / 3), (6500.0, 1.0)])

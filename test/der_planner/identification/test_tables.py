@@ -164,7 +164,7 @@ def lab_log(path, rest_from, rest_to):
     return path
 
 
-@pytest.mark.parametrize("rest_until", [10.0, "auto"])
+@pytest.mark.parametrize("rest_until", [10.0, "auto", ""])
 def test_each_log_finds_its_own_rest_even_if_it_is_not_exactly_zero(tmp_path, rest_until):
     """One map serves a log that rests first and one that rests last, at 0.09 hPa."""
     columns = ColumnMap(**{**COLUMNS, "angles": ("u",), "tags": (), "rest_until": rest_until})
@@ -172,8 +172,12 @@ def test_each_log_finds_its_own_rest_even_if_it_is_not_exactly_zero(tmp_path, re
         log = read_csv(lab_log(tmp_path / f"{name}.csv", begin, end), columns)
         resting = (log.time > begin) & (log.time < end)
         np.testing.assert_allclose(log.measured_differential[resting], 0.0, atol=1e-6)
+    never = lab_log(tmp_path / "never.csv", 70.0, 80.0)
+    if not rest_until:  # nothing was asked for
+        assert np.nanmean(read_csv(never, columns).measured_differential) > 2.0
+        return
     with pytest.raises(LogError, match="no row at rest: its commands never come"):
-        read_csv(lab_log(tmp_path / "never.csv", 70.0, 80.0), columns)
+        read_csv(never, columns)
 
 
 def test_an_excitation_is_written_into_a_new_folder_and_read_back(tmp_path):

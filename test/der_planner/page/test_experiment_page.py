@@ -94,7 +94,7 @@ def test_the_page_is_there_before_the_first_run_and_after_the_last(
     def play(options: Options, progress: Progress) -> None:
         progress.say("calibrates")
         wait_for(lambda: visitor.look() == ("calibrates", False), "what the experiment does")
-        (options.out / "report").mkdir(parents=True)
+        (options.out / "report").mkdir(parents=True, exist_ok=True)
         (options.out / "report" / "report.html").write_text("what there is of it")
         reader.start()
         raise GraphError(why)

@@ -123,20 +123,25 @@ def told(problem: BendFit, values: Array) -> tuple[tuple[Unknown, ...], Array]:
     covariance = problem.search.covariance(values)
     deviation = np.sqrt(np.diag(covariance))
     correlation = covariance / np.outer(deviation, deviation)
-    stiff = [term.name == "log_stiffness" for term in free.terms]
-    deviation[stiff] = np.maximum(deviation[stiff], STIFFNESS_ERROR)
     at_bound, before = free.unknowns.at_bound(values), terms_of(free.limb)
+    apart = np.abs(values - free.at_places(free.values))
+    # Friction and creep of slow motion tell another stiffness than swings or a weight do.
+    least = [
+        (max(STIFFNESS_ERROR, gap) if term.spread < before[place].spread else STIFFNESS_ERROR)
+        * (term.name == "log_stiffness")
+        for term, (_, place), gap in zip(free.terms, free.places, apart, strict=True)
+    ]
     unknowns = tuple(
         Unknown(
             name=_name(term, segment),
             unit=term.unit,
             value=float(value),
-            deviation=float(sigma),
+            deviation=float(max(sigma, low)),
             untold=bool(sigma > UNTOLD * before[place].spread),
             at_bound=bool(edge),
         )
-        for term, (segment, place), value, sigma, edge in zip(
-            free.terms, free.places, values, deviation, at_bound, strict=True
+        for term, (segment, place), value, sigma, low, edge in zip(
+            free.terms, free.places, values, deviation, least, at_bound, strict=True
         )
     )
     return unknowns, correlation
