@@ -24,6 +24,14 @@ if (!window.did_handshake || !button || button.disabled) return false;
 button.click();
 return true;
 """
+LONG_ROWS = """
+for (const row of document.querySelectorAll("#nodes tr")) {
+  row.firstElementChild.textContent = "/another/limb/apriltag_tracker";
+  row.lastElementChild.textContent = "12345.6 s ago";
+}
+const vent = document.getElementById("vent").getBoundingClientRect();
+return [Math.max(vent.right, document.documentElement.scrollWidth), vent.bottom];
+"""
 FOR_EVER = """
 const set = window.setTimeout;
 window.setTimeout = (action, time) => (time < 30000 ? set(action, time) : 0);
@@ -120,6 +128,15 @@ def test_one_arms_and_everybody_vents(rig: WatchedPage) -> None:
     assert abs(rig.states[-1].measured_differential[0]) < 1000.0
     second.find_element("id", "vent").click()  # or it is held, after the browser has gone
     rig.wait_mode(PressureState.DISARMED)
+
+
+def test_long_rows_do_not_push_vent_off_a_telephone(rig: WatchedPage) -> None:
+    browser = rig.open()
+    telephone = {"width": 320, "height": 568, "deviceScaleFactor": 1, "mobile": True}
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", telephone)
+    rig.wait(lambda: browser.find_elements("css selector", "#nodes td"), "the nodes")
+    right, bottom = browser.execute_script(LONG_ROWS)
+    assert (right <= 320, bottom <= 568) == (True, True)
 
 
 def hold(rig: WatchedPage, browser: Any) -> None:
