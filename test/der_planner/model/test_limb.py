@@ -84,6 +84,7 @@ def test_a_parameter_that_another_needs_may_not_be_zero():
         ("segments", "bending_stiffness", 17_500.0, r"segments\[0\] would bend by .* N·m²"),
         ("segments", "moment_gain", 9.1e-3, r"segments\[0\] would bend by .* N·m/Pa"),
         ("segments", "mass_per_length", 1066.0, "weighs .* give mass_per_length in kg/m"),
+        ("masses", "mass", 8.0, "weighs 8.* masses in kg"),
         ("pneumatics", "pressure_limit", 24.0, "would bend by .* pressure_limit in Pa"),
         ("pneumatics", "slew_limit", 9.0, "more than 60 s: give .* slew_limit in Pa/s"),
         ("pneumatics", "time_constant", 150.0, "more than 60 s: give time_constant"),
@@ -91,7 +92,8 @@ def test_a_parameter_that_another_needs_may_not_be_zero():
 )
 def test_a_limb_file_in_other_units_is_refused(tmp_path, part, name, value, reason):
     content = yaml.safe_load(DEFAULT_LIMB_FILE.read_text(encoding="utf-8"))
-    (content[part][0] if part == "segments" else content[part])[name] = value
+    content["masses"] = [{"arc_length": 0.2, "mass": 0.008}]
+    (content[part] if part == "pneumatics" else content[part][0])[name] = value
     (tmp_path / "limb.yaml").write_text(yaml.safe_dump(content))
     with pytest.raises(LimbError, match=reason):
         Limb.from_yaml(tmp_path / "limb.yaml")

@@ -115,7 +115,7 @@ class Limb:
                     "bending_stiffness in N·m², moment_gain in N·m/Pa, length in m and "
                     "pressure_limit in Pa"
                 )
-        if self.mass > HEAVIEST:
+        if self.mass > min(HEAVIEST, (1.0 + MOST_CARRIED) * self._own_mass):
             raise LimbError(
                 f"the limb weighs {self.mass:.3g} kg: give mass_per_length in kg/m, masses in kg"
             )
