@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import signal
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,8 @@ from driver_bench import Bench
 
 from benchmarks.browser import open_browser
 from der_msgs.msg import PressurePlan, PressureState
+from der_planner.experiment.client import GraphClient
+from der_planner.experiment.processes import GraphError
 from der_planner.limb import Limb
 from limb_interfaces import qos, topics
 
@@ -42,7 +45,7 @@ def rig(graph: Any, tmp_path: Path) -> tuple[Bench, str]:
     limb_file = tmp_path / "limb.yaml"
     replace(Limb.default(), name="the planner's own").to_yaml(limb_file)
     graph.start("der_planner", "planner", default_method="projected", limb_file=str(limb_file))
-    _, url = start_page(graph, drawings=str(tmp_path / "drawings"), lease_period=3.0)
+    _, url = start_page(graph, drawings=str(tmp_path / "drawings"), lease_period=6.0)
     bench = Bench(graph, bounds={})
     graph.client.wait_ready([process.executable for process in graph.processes])
     return bench, url
@@ -56,6 +59,15 @@ def browser(tmp_path: Path) -> Any:
         window.quit()
 
 
+def press_enabled(client: GraphClient, browser: Any, name: str) -> None:
+    button, why = (browser.find_element("id", each) for each in (name, "why"))
+    try:
+        client.wait_for(button.is_enabled, 120.0, f"the button {name}")
+    except GraphError as error:
+        raise AssertionError(f"{error}, which is grey: {why.text}") from error
+    browser.execute_script(f"document.getElementById('{name}').click()")
+
+
 def test_a_drawing_is_previewed_played_and_kept(
     rig: tuple[Bench, str], browser: Any, tmp_path: Path
 ) -> None:
@@ -66,9 +78,7 @@ def test_a_drawing_is_previewed_played_and_kept(
     def wait(script: str, what: str) -> Any:
         return client.wait_for(lambda: browser.execute_script(script), 120.0, what)
 
-    def press(name: str) -> None:
-        client.wait_for(browser.find_element("id", name).is_enabled, 120.0, f"the button {name}")
-        browser.execute_script(f"document.getElementById('{name}').click()")
+    press = partial(press_enabled, client, browser)
 
     limb_drawn = "return page.data.nodes.find((node) => node.own === 'page').values.limb"
     wait(f'{limb_drawn} === "the planner\'s own"', "the page to draw with the planner's limb")
