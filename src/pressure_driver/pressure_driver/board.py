@@ -310,8 +310,10 @@ class BoardProcess:
             if self.core.clock() > deadline:
                 left = self.core.highest_pressure()
                 age = self.core.monitor.telemetry_age(self.core.clock())
-                heard = f", {age:.1f} s ago," if age > EMPTYING_TIME / 2 else ""
-                return f"the chambers on {self._port} keep{heard} {left:.0f} Pa: {lines.ADVICE}"
+                kept = f"keep {left:.0f} Pa"
+                if age > EMPTYING_TIME / 2:
+                    kept = f"held {left:.0f} Pa when last heard, {age:.1f} s ago"
+                return f"the chambers on {self._port} {kept}: {lines.ADVICE}"
             self._turn()
         return ""
 

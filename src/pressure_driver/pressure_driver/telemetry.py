@@ -274,8 +274,8 @@ class TelemetryMonitor:
     def silence(self, now: float) -> str:
         """Return that the board is silent or speaks without being understood, or nothing."""
         age = self.telemetry_age(now)
-        _, damaged, bad = self._recent_lines(now)
         if math.isnan(age):
+            _, damaged, bad = self._recent_lines(now)
             if bad >= MOST_BAD_READINGS:
                 return self._describe_nonsense(bad)
             if damaged >= MOST_DAMAGED or now - self._strange_since > STRANGE_TIME:
@@ -286,6 +286,7 @@ class TelemetryMonitor:
                 )
             return "no telemetry from the board yet; look at its power, its cable and 'port'"
         if age > self._settings.telemetry_timeout:
+            _, damaged, _ = self._recent_lines(now)
             damage = f"; lines are damaged{self._last_damaged()}" if damaged else ""
             return f"no telemetry: the last came {age:.1f} s ago{damage}"
         patience = self._settings.frozen_time if self._protocol.tells_pascals else 0.0

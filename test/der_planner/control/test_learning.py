@@ -10,6 +10,7 @@ from limbs import mean_error, other_limb, play
 from link_chain import LinkChain
 
 from der_planner.control import Learner, LearningError
+from der_planner.control.disturbance import later
 from der_planner.limb import Limb
 from der_planner.model import simulate
 from der_planner.planning import CONTROL_PERIOD, Motion, plan
@@ -304,6 +305,12 @@ def test_tips_that_are_swapped_or_late_or_stand_still_teach_nothing(first, turne
     learner.add(first.time, turned(first.tip_predicted))
     assert not learner.history[0].accepted
     assert re.search(reason, learner.history[0].reason)
+
+
+def test_a_short_run_can_be_late_too(first):
+    tip = first.tip_predicted[20:50]
+    assert later(tip, tip) == 0
+    assert later(first.tip_predicted[15:45], tip) == 5
 
 
 def test_chambers_are_told_in_any_order_with_gaps_and_refused_where_they_do_not_fit(first):

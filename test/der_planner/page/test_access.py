@@ -89,10 +89,8 @@ def test_the_address_with_the_token_opens_the_page_and_is_remembered(access: Acc
     with pytest.raises(WebSocketDisconnect), browser.websocket_connect(SOCKET):
         pass
     answer = browser.get(f"/read?token={TOKEN}")
-    assert (answer.status_code, answer.headers["location"]) == (
-        303,
-        "/read",
-    )  # whatever a proxy is called
+    # Whatever a proxy is called.
+    assert (answer.status_code, answer.headers["location"]) == (303, "/read")
     assert "HttpOnly" in answer.headers["set-cookie"]
     assert browser.get("/read").status_code == 200
     assert browser.post("/vent").status_code == 200

@@ -130,14 +130,14 @@ class BagReader:
             )
         return found
 
-    def is_installed(self, type_name: str) -> bool:
-        """Return whether a type of the bag has here the fields that it had there.
+    def fits_installed(self, type_name: str) -> bool:
+        """Return whether a type of the bag has the fields of the one that is installed here.
 
         Raises:
             DefinitionError: it is not installed here.
         """
-        recorded: str = self._store.hash_rihs01(type_name)
-        return recorded == find_definition(type_name).type_hash
+        installed = find_definition(type_name).type_hash
+        return bool(self._store.hash_rihs01(type_name) == installed)
 
     @property
     def start(self) -> int:

@@ -97,7 +97,9 @@ def choose_topics(bag: BagReader, wanted: Selection) -> dict[str, RecordedTopic]
     """Return the topics to play by the name to publish on.
 
     Raises:
-        BagError: a name that is asked for or remapped is not in the bag, or two share a name.
+        BagError: a name that is asked for or remapped is not in the bag, two share a name, or
+            a type is of another version than here.
+        DefinitionError: a type is not installed here.
     """
     known = bag.topics
     for name in (*wanted.topics, *wanted.remap):
@@ -109,7 +111,7 @@ def choose_topics(bag: BagReader, wanted: Selection) -> dict[str, RecordedTopic]
         if target in chosen:
             raise BagError(f"{chosen[target].name} and {name} would both be played on {target}")
         chosen[target] = known[name]
-    others = sorted({t.type_name for t in chosen.values() if not bag.is_installed(t.type_name)})
+    others = sorted({t.type_name for t in chosen.values() if not bag.fits_installed(t.type_name)})
     if others:
         raise BagError(
             f"{bag.path} has another version of {', '.join(others)} than is installed here, whose "

@@ -67,8 +67,15 @@ Kept = list[tuple[Trial, dict[str, Any]]]
 FAILURES = (GraphError, NodeError, PlanningError, LearningError, LogError, OSError)
 """What may end an experiment before its last trial."""
 SAME = (
-    *("amplitude", "period", "cycles", "calibrate", "offline"),
-    *("poses", "board", "reaction", "force_limit"),
+    "amplitude",
+    "period",
+    "cycles",
+    "calibrate",
+    "offline",
+    "poses",
+    "board",
+    "reaction",
+    "force_limit",
 )
 """Options that an experiment which goes on must share with the stopped one."""
 SAME_FILES = ("limb", "path", "obstacles")

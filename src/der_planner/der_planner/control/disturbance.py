@@ -268,7 +268,8 @@ def later(tip: Array, expected: Array) -> int:
         expected: (K, 2) tip of the model under the commands [m].
     """
     left: dict[int, float] = {}
-    for lag in range(-_MOST_LATE, _MOST_LATE + 1):
+    most = min(_MOST_LATE, len(tip) // 2)
+    for lag in range(-most, most + 1):
         end = len(tip) - abs(lag)
         apart = tip[max(lag, 0) :][:end] - expected[max(-lag, 0) :][:end]
         apart = apart[np.isfinite(apart).all(axis=1)]

@@ -284,7 +284,8 @@ class Learner:
                 shown = Shown(np.where(kept[:, None], shown.value, np.nan), shown.variance, kept)
         astray = astray or moves_with(expected.tip + shown.value, expected.tip)
         if not astray and (lag := later(tip, expected.tip)):
-            astray = f"its times are {lag * CONTROL_PERIOD:.2g} s later than those of the plan"
+            side = "later" if lag > 0 else "earlier"
+            astray = f"its times are {abs(lag) * CONTROL_PERIOD:.2g} s {side} than the plan's"
         inside = (measured.time >= plan.time[0]) & (measured.time <= plan.time[-1])
         wanted = interpolate(measured.time[inside], plan.time, plan.tip_reference)
         missed = np.linalg.norm(measured.tip[inside] - wanted, axis=1)

@@ -292,14 +292,14 @@ def read_csv(path: str | Path, columns: ColumnMap) -> CalibrationLog:
         tip = columns.factor("length_unit") * pick(columns.tip)
     if columns.rest_until != 0:
         rest = _rest(time, command, columns.rest_until)
-        if columns.rest_until and not rest.any():
+        if rest.any():
+            measured = measured - np.nanmean(measured[rest], axis=0)
+        elif columns.rest_until:
             raise LogError(
                 f"{path} has no row at rest: its commands never come within "
                 f"{100 * REST_SHARE:.0f} % of their largest to zero. Leave rest_until out of the "
                 "column map if the chambers' sensors have no offset"
             )
-        if rest.any():
-            measured = measured - np.nanmean(measured[rest], axis=0)
     if columns.tags:
         tags = pick(columns.tags)
         lost = np.all(np.diff(tags, axis=0, prepend=np.nan) == 0, axis=1)
@@ -339,7 +339,7 @@ def _rest(time: Array, command: Array, rest_until: float | str) -> NDArray[np.bo
     Args:
         time: (K,) [s].
         command: (K, M) in any unit.
-        rest_until: [s], or ``auto`` for the longest rest.
+        rest_until: [s]; ``auto``, or nothing: the longest rest.
     """
     size = np.abs(command).max(axis=1)
     near: NDArray[np.bool_] = size <= REST_SHARE * np.nanmax(size)

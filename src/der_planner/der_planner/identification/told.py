@@ -124,24 +124,29 @@ def told(problem: BendFit, values: Array) -> tuple[tuple[Unknown, ...], Array]:
     deviation = np.sqrt(np.diag(covariance))
     correlation = covariance / np.outer(deviation, deviation)
     at_bound, before = free.unknowns.at_bound(values), terms_of(free.limb)
-    apart = np.abs(values - free.at_places(free.values))
+    stiff = [term.name == "log_stiffness" for term in free.terms]
+    spread = np.array([before[place].spread for _, place in free.places])
     # Friction and creep of slow motion tell another stiffness than swings or a weight do.
-    least = [
-        (max(STIFFNESS_ERROR, gap) if term.spread < before[place].spread else STIFFNESS_ERROR)
-        * (term.name == "log_stiffness")
-        for term, (_, place), gap in zip(free.terms, free.places, apart, strict=True)
-    ]
+    measured = free.unknowns.spread < spread
+    apart = np.where(measured, np.abs(values - free.unknowns.prior), 0.0)
+    least = np.where(stiff, np.maximum(apart, STIFFNESS_ERROR), 0.0)
     unknowns = tuple(
         Unknown(
             name=_name(term, segment),
             unit=term.unit,
             value=float(value),
-            deviation=float(max(sigma, low)),
-            untold=bool(sigma > UNTOLD * before[place].spread),
+            deviation=float(sigma),
+            untold=bool(out),
             at_bound=bool(edge),
         )
-        for term, (segment, place), value, sigma, low, edge in zip(
-            free.terms, free.places, values, deviation, least, at_bound, strict=True
+        for term, (segment, _), value, sigma, out, edge in zip(
+            free.terms,
+            free.places,
+            values,
+            np.maximum(deviation, least),
+            deviation > UNTOLD * spread,
+            at_bound,
+            strict=True,
         )
     )
     return unknowns, correlation
