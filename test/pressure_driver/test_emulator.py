@@ -1,9 +1,7 @@
 """Boards of our own making: the emulated one, its air and port, and a lab's driver as a board."""
 
-import contextlib
 import math
 import os
-import select
 
 import numpy as np
 import pytest
@@ -118,50 +116,18 @@ def test_dropped_and_corrupted_bytes_come_in_the_stated_share():
 # ------------------------------------------------------------------------------------- port
 
 
-def open_host(port):
-    return os.open(port.link, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
-
-
-def test_the_port_paces_bytes_both_ways(tmp_path):
-    port = EmulatedPort(str(tmp_path / "board"), 9600)
-    host = open_host(port)
-    byte = round(1e10 / 9600)
-    try:
-        port.read(0)
-        os.write(host, b"x" * 96)
-        now = 1000
-        assert select.select(port.watched(), [], [], 10.0)[0]
-        port.read(now)
-        assert port.arrived(now + 96 * byte - 1000) == []
-        assert port.arrived(now + 96 * byte) == [(now, b"x" * 96)]
-        port.pump(now)
-        port.send(b"y" * 50)
-        got = b""
-        for step in range(1, 60):
-            port.pump(now + step * byte)
-            with contextlib.suppress(BlockingIOError):
-                got += os.read(host, 100)
-            assert len(got) <= step
-        while len(got) < 50 and select.select([host], [], [], 10.0)[0]:
-            got += os.read(host, 100)
-        assert got == b"y" * 50
-    finally:
-        os.close(host)
-        port.close()
-
-
 def test_the_port_overwrites_no_file_and_takes_no_link_from_another_emulator(tmp_path):
     (tmp_path / "file").write_text("precious")
     with pytest.raises(FileExistsError, match="port_link"):
-        EmulatedPort(str(tmp_path / "file"), 0)
+        EmulatedPort(str(tmp_path / "file"))
     assert (tmp_path / "file").read_text() == "precious"
-    first = EmulatedPort(str(tmp_path / "board"), 0)
+    first = EmulatedPort(str(tmp_path / "board"))
     device = os.readlink(first.link)
     with pytest.raises(FileExistsError, match="another emulator serves"):
-        EmulatedPort(first.link, 0)
+        EmulatedPort(first.link)
     assert os.readlink(first.link) == device
     first.close()
-    EmulatedPort(first.link, 0).close()
+    EmulatedPort(first.link).close()
 
 
 ROOM = 101_325.0

@@ -50,7 +50,7 @@ class Rig:
             if protocol == "festo"
             else str(folder / f"board_{protocol}")
         )
-        self.port = emulated_line(link, 115_200)
+        self.port = emulated_line(link)
         air = BoardPneumatics(2, 1)
         # Valves ten times as wide, so that nobody waits for the air.
         air._fill_rate, air._vent_coefficient = 10 * air._fill_rate, 10 * air._vent_coefficient

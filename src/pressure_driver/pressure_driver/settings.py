@@ -197,7 +197,6 @@ class EmulatorSettings:
         "symbolic link to the pseudo-terminal, or tcp://host:port to listen at",
     )
     protocol: str = _other("ezloop", "language of the board", NAMES)
-    baud_rate: int = _number(115_200, "baud", 0, 4_000_000, "pace of the bytes; 0: none")
     terminal: str = _other("vtem", TERMINAL, TERMINALS)
     device: int = _number(0, "", 0, 3, DEVICE)
     sensor_range: float = _number(689_500.0, "Pa", 1e3, 1e7, SENSOR_RANGE)

@@ -9,105 +9,52 @@ import pty
 import socket
 import tty
 from abc import ABC, abstractmethod
-from collections import deque
 from pathlib import Path
+from typing import ClassVar
 
 from pressure_driver.lines import is_tcp, tcp_address
 
-BITS_PER_BYTE = 10
-"""Start bit, eight data bits, stop bit."""
-LONGEST_LOOK = 20_000_000
-"""[ns] between two looks for a host that opens the line."""
-PACE = 2_000_000
-"""[ns] between two looks while bytes leave at a baud rate."""
-
 
 class BoardLine(ABC):
-    """A line that can be unplugged.
-
-    Bytes to the host leave at the baud rate; bytes from the host reach the firmware when the last
-    of them would have come over a real line.
+    """A line that can be unplugged. Bytes cost no time.
 
     Args:
         link: where a driver finds it.
-        baud_rate: [baud] of both directions; 0 for a line without delay.
     """
 
-    def __init__(self, link: str, baud_rate: int = 0) -> None:
+    boots_when_opened: ClassVar[bool]
+    """Whether a host that opens the line restarts the board, as where its reset is wired to DTR."""
+
+    def __init__(self, link: str) -> None:
         self.link = link
         self.host_present = False
         """Whether a host has the line open."""
-        self._byte_time = round(BITS_PER_BYTE * 1e9 / baud_rate) if baud_rate else 0
-        self._outgoing = bytearray()
-        self._sent_until = 0
-        self._incoming: deque[tuple[int, int, bytes]] = deque()
-        self._line_free = 0
 
     @abstractmethod
     def plug(self) -> None:
         """Appear, if it is not there."""
 
+    @abstractmethod
     def unplug(self) -> None:
         """Disappear, in the middle of whatever was being said."""
-        self.host_present = False
-        self._outgoing.clear()
-        self._incoming.clear()
 
     @abstractmethod
     def watched(self) -> list[int]:
         """Return the descriptors to wait for."""
 
     @abstractmethod
-    def read(self, now: int) -> bool:
-        """Take what the host has sent, as of now [ns]; return whether it just opened a port."""
-
-    @abstractmethod
-    def _write(self, data: bytes) -> int:
-        """Hand bytes to the operating system without waiting; return how many it has taken."""
-
-    def _take(self, data: bytes, now: int) -> None:
-        first = max(now, self._line_free)
-        self._line_free = first + len(data) * self._byte_time
-        self._incoming.append((self._line_free, first, data))
-
-    def arrived(self, now: int) -> list[tuple[int, bytes]]:
-        """Return (arrival of the first byte [ns], bytes) of what the firmware can read now."""
-        ready = []
-        while self._incoming and self._incoming[0][0] <= now:
-            _, first, data = self._incoming.popleft()
-            ready.append((first, data))
-        return ready
+    def read(self) -> bytes:
+        """Take what the host has sent, and see whether it is there."""
 
     def send(self, data: bytes) -> None:
-        """Queue bytes for the host; they are dropped while nobody listens."""
-        if self.host_present:
-            self._outgoing += data
+        """Hand bytes to the host; those that it leaves no room for are lost, as on a real line."""
+        if self.host_present and data:
+            with contextlib.suppress(OSError):
+                self._write(data)
 
-    def pump(self, now: int) -> None:
-        """Write as many queued bytes as the line has had time for."""
-        if not self._outgoing or not self.host_present:
-            self._outgoing.clear()
-            self._sent_until = now
-            return
-        count = len(self._outgoing)
-        if self._byte_time:
-            count = min(count, (now - self._sent_until) // self._byte_time)
-        if count <= 0:
-            return
-        try:
-            written = self._write(bytes(self._outgoing[:count]))
-        except OSError:  # the host does not read, or has gone: a real line loses bytes, too
-            self._outgoing.clear()
-            return
-        del self._outgoing[:written]
-        self._sent_until = max(self._sent_until + written * self._byte_time, now - 10**8)
-
-    def next_event(self, now: int) -> int:
-        """Return the time [ns] until the line needs service, if no byte comes first."""
-        waits = [PACE if self._outgoing else LONGEST_LOOK]
-        if self._incoming:
-            waits.append(self._incoming[0][0] - now)
-        return max(0, min(waits))
+    @abstractmethod
+    def _write(self, data: bytes) -> None:
+        """Hand bytes to the operating system without waiting."""
 
     def close(self) -> None:
         """Leave for good."""
@@ -122,8 +69,10 @@ class EmulatedPort(BoardLine):
             stands there.
     """
 
-    def __init__(self, link: str, baud_rate: int) -> None:
-        super().__init__(link, baud_rate)
+    boots_when_opened = True
+
+    def __init__(self, link: str) -> None:
+        super().__init__(link)
         self._path = Path(link)
         self._master: int | None = None
         self._claim()
@@ -161,7 +110,7 @@ class EmulatedPort(BoardLine):
 
     def unplug(self) -> None:
         """Disappear, and the stable name as well."""
-        super().unplug()
+        self.host_present = False
         if self._master is not None:
             self._path.unlink(missing_ok=True)
             os.close(self._master)
@@ -171,22 +120,22 @@ class EmulatedPort(BoardLine):
         """Return the descriptors to wait for; empty while no host has the port open."""
         return [] if self._master is None or not self.host_present else [self._master]
 
-    def read(self, now: int) -> bool:
-        """Take what the host has sent, as of now [ns]; return whether it just opened the port."""
+    def read(self) -> bytes:
+        """Take what the host has sent, and see whether it has the port open."""
         if self._master is None:
-            return False
-        was_present, self.host_present = self.host_present, True
+            return b""
+        self.host_present = True
         try:
-            self._take(os.read(self._master, 4096), now)
+            return os.read(self._master, 4096)
         except BlockingIOError:
             pass
         except OSError:  # nobody has the other end open
             self.host_present = False
-        return self.host_present and not was_present
+        return b""
 
-    def _write(self, data: bytes) -> int:
+    def _write(self, data: bytes) -> None:
         assert self._master is not None
-        return os.write(self._master, data)
+        os.write(self._master, data)
 
     def close(self) -> None:
         """Remove the port for good."""
@@ -199,8 +148,7 @@ class EmulatedPort(BoardLine):
 class BoardSocket(BoardLine):
     """A board in a network: what an emulated board and `topic_board` listen with.
 
-    Bytes cost no time. The newest connection counts: whoever makes it has to vent. Nobody restarts
-    a board by connecting.
+    The newest connection counts: whoever makes it has to vent.
 
     Args:
         link: `tcp://host:port` to listen at.
@@ -208,6 +156,8 @@ class BoardSocket(BoardLine):
     Raises:
         OSError: the address is not this computer's, or another program listens there.
     """
+
+    boots_when_opened = False
 
     def __init__(self, link: str) -> None:
         super().__init__(link)
@@ -223,7 +173,7 @@ class BoardSocket(BoardLine):
 
     def unplug(self) -> None:
         """Reset the connection and listen no more."""
-        super().unplug()
+        self.host_present = False
         for each in (self._server, self._host):
             if each is not None:
                 each.close()
@@ -233,40 +183,39 @@ class BoardSocket(BoardLine):
         """Return the descriptors to wait for."""
         return [each.fileno() for each in (self._server, self._host) if each is not None]
 
-    def read(self, now: int) -> bool:
-        """Take what the host has sent, as of now [ns]."""
+    def read(self) -> bytes:
+        """Take what the host has sent, and see whether it is there."""
+        data = b""
         with contextlib.suppress(BlockingIOError):
             while self._server is not None:
                 host, _ = self._server.accept()
-                self._hear(now)
+                data += self._hear()
                 if self._host is not None:
                     self._host.close()
                 self._host = host
                 host.setblocking(False)
                 host.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._hear(now)
+        data += self._hear()
         self.host_present = self._host is not None
-        return False
+        return data
 
-    def _hear(self, now: int) -> None:
+    def _hear(self) -> bytes:
         """Take what the host has sent, or see that it has gone."""
-        if self._host is None:
-            return
         data = b""
-        with contextlib.suppress(BlockingIOError):
-            with contextlib.suppress(ConnectionError):
-                data = self._host.recv(1 << 16)
-            if data:
-                self._take(data, now)
-            else:
-                self._host.close()
-                self._host = None
+        if self._host is not None:
+            with contextlib.suppress(BlockingIOError):
+                with contextlib.suppress(ConnectionError):
+                    data = self._host.recv(1 << 16)
+                if not data:
+                    self._host.close()
+                    self._host = None
+        return data
 
-    def _write(self, data: bytes) -> int:
+    def _write(self, data: bytes) -> None:
         assert self._host is not None
-        return self._host.send(data)
+        self._host.send(data)
 
 
-def emulated_line(link: str, baud_rate: int) -> BoardLine:
+def emulated_line(link: str) -> BoardLine:
     """Return the board's end of `tcp://host:port`, or of a serial port with a symbolic link."""
-    return BoardSocket(link) if is_tcp(link) else EmulatedPort(link, baud_rate)
+    return BoardSocket(link) if is_tcp(link) else EmulatedPort(link)

@@ -39,7 +39,7 @@ class BoardEmulator(Node):
         protocol.configure(settings)
         self._board = EmulatedBoard(protocol, pneumatics, settings.seed)
         faults = self._parse(settings.faults)  # before the port stands where others see it
-        self._port = emulated_line(settings.port_link, settings.baud_rate)
+        self._port = emulated_line(settings.port_link)
         self._unpublished: deque[tuple[str, int, Sequence[float]]] = deque(maxlen=1000)
         self._sequences: Counter[str] = Counter()
         self._guard = self.create_guard_condition(self._publish)

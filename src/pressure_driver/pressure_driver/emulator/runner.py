@@ -21,6 +21,8 @@ TELEMETRY_PERIOD = 50_000_000
 """[ns] 20 Hz, as boards report."""
 AIR_PERIOD = 20_000_000
 """[ns] 50 Hz, at which chamber pressures are published."""
+LONGEST_LOOK = 20_000_000
+"""[ns] between two looks for a host that opens the line."""
 LONGEST_STEP = 0.1
 """[s] by which the board's time advances at once: when this process stands still, or the wall clock
 is set, the board's watchdog does not run out meanwhile."""
@@ -86,9 +88,8 @@ class BoardRunner:
         next_telemetry, next_air, air_time = now, now, now
         while not self._stop.is_set():
             now = time.time_ns()
-            due = min(next_telemetry, next_air) - now
-            wait = max(0, min(due, self.port.next_event(now))) / NANOSECONDS
-            select.select(self.port.watched(), [], [], wait)
+            due = min(next_telemetry, next_air, now + LONGEST_LOOK) - now
+            select.select(self.port.watched(), [], [], max(due, 0) / NANOSECONDS)
             now = time.time_ns()
             self._serve_line(now)
             while self._requests:
@@ -110,14 +111,14 @@ class BoardRunner:
                 self.port.send(self._delayed.popleft()[1])
 
     def _serve_line(self, now: int) -> None:
-        if self.port.read(now):  # as on boards whose reset is wired to DTR
+        was_present, data = self.port.host_present, self.port.read()
+        if self.port.boots_when_opened and self.port.host_present and not was_present:
             self.port.send(self.board.boot())
-        for stamp, data in self.port.arrived(now):
+        if data:
             commands, answer = self.board.receive(data)
             self.port.send(answer)
             for pressure in commands:
-                self._on_command(stamp, pressure)
-        self.port.pump(now)
+                self._on_command(now, pressure)
 
     def _apply(self, faults: Faults, now: int) -> None:
         self.board.set_faults(faults)

@@ -55,11 +55,9 @@ class TopicBoard(Node):
 
     def _serve(self) -> None:
         now = time.monotonic()
-        self._socket.read(0)
-        for _, data in self._socket.arrived(0):
+        if data := self._socket.read():
             self._socket.send(self._board.receive(data, now))
         self._socket.send(self._board.look(now))
-        self._socket.pump(0)
 
     def _publish(self, gauge: Sequence[float]) -> None:
         values = to_topic(gauge, self._settings)
@@ -85,7 +83,6 @@ class TopicBoard(Node):
             return
         self._refused = ""
         self._socket.send(self._board.measured(gauge, time.monotonic()))
-        self._socket.pump(0)
 
     def _report(self) -> Health:
         problem, present = self._refused, self._socket.host_present
