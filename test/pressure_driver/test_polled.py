@@ -13,7 +13,7 @@ from pymodbus.simulator import DataType, SimData, SimDevice
 from waiting import Clock, wait_for
 
 from pressure_driver.emulator import BoardReading
-from pressure_driver.emulator.polled import FestoBoard, PneudriveBoard
+from pressure_driver.emulator.firmware import FestoBoard, PneudriveBoard
 from pressure_driver.lines import Line
 from pressure_driver.protocols import BoardFailure, Echo, Telemetry, festo, host_protocol
 from pressure_driver.safety import Mode

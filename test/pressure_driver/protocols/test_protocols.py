@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from pressure_driver.emulator import BoardReading
-from pressure_driver.emulator.firmware import BOARDS, NativeBoard
-from pressure_driver.emulator.polled import BUS_PATIENCE
+from pressure_driver.emulator.firmware import BOARDS, BUS_PATIENCE, NativeBoard
 from pressure_driver.following import chamber_gauge
 from pressure_driver.protocols import (
     NAMES,
