@@ -8,7 +8,7 @@ import pytest
 from apriltag_tracker.detection import Detector
 from apriltag_tracker.pipeline import LimbTracker
 from apriltag_tracker.pose.shape import FollowerOptions, Uncertainty
-from apriltag_tracker.synthetic.camera import Errors, Optics, SyntheticCamera
+from apriltag_tracker.synthetic.camera import Optics, SyntheticCamera
 
 pytestmark = pytest.mark.slow
 
@@ -64,8 +64,17 @@ def test_set_up_errors_stay_within_the_systematic_part(plain, model, swing):
     options = FollowerOptions(uncertainty=uncertainty, reject_beyond=0.01)
     normalised = []
     for seed in range(8):
-        errors = Errors(survey=5e-4, mounting=4e-4, mounting_angle=5e-3)
-        camera = SyntheticCamera(model, plain, Optics(), errors, seed=seed)
+        random = np.random.default_rng(seed)
+        limb = [
+            dataclasses.replace(tag, offset=random.normal(0.0, [4e-4, 4e-4, 5e-3]))
+            for tag in plain.limb
+        ]
+        world = [
+            dataclasses.replace(tag, position=random.normal(tag.position, [5e-4, 5e-4, 0.0]))
+            for tag in plain.world
+        ]
+        really = dataclasses.replace(plain, limb=tuple(limb), world=tuple(world))
+        camera = SyntheticCamera(model, really, Optics(), seed=seed)
         tracker = LimbTracker(plain, model.intrinsics, options)
         error, observations = run(tracker, camera, swing, 2, start=20)
         spread = observations[-1].estimate.tip_systematic

@@ -17,7 +17,6 @@ from apriltag_tracker.camera import CameraError, CameraPose, Intrinsics, project
 from apriltag_tracker.synthetic import render
 from apriltag_tracker.synthetic.shapes import (
     MOST_INSTANTS,
-    PLACEMENT,
     Exposure,
     Mounts,
     Placements,
@@ -51,21 +50,6 @@ class Optics:
     black: float = 28.0
     white: float = 205.0
     light_fall: float = 0.25
-
-
-@dataclass(frozen=True)
-class Errors:
-    """How far the set-up is from what the tag map says, drawn from the seed; zero by default.
-
-    Attributes:
-        survey: standard deviation of the world tags' positions [m].
-        mounting: standard deviation of the limb tags' positions on the limb [m].
-        mounting_angle: standard deviation of the limb tags' directions [rad].
-    """
-
-    survey: float = 0.0
-    mounting: float = 0.0
-    mounting_angle: float = 0.0
 
 
 @dataclass
@@ -124,8 +108,7 @@ class SyntheticCamera:
         model: lens and place of the camera.
         tags: where the tags are.
         optics: picture quality.
-        errors: differences between the tag map and the set-up.
-        seed: of noise, floor and errors.
+        seed: of noise and floor.
     """
 
     def __init__(
@@ -133,13 +116,11 @@ class SyntheticCamera:
         model: CameraModel,
         tags: TagMap,
         optics: Optics | None = None,
-        errors: Errors | None = None,
         seed: int = 0,
     ) -> None:
         self.model = model
         self.tags = tags
         self.optics = optics or Optics()
-        self.errors = errors or Errors()
         self._random = np.random.default_rng(seed)
         self._eye = self._make_eye()
         scale = model.intrinsics.matrix[0, 0] / model.pose.position[2]
@@ -149,8 +130,13 @@ class SyntheticCamera:
         # Saturated sums of bytes take a quarter of the time of a sum of bytes and signed noise.
         self._brighter = np.maximum(self._noise, 0).astype(np.uint8)
         self._darker = np.maximum(-self._noise, 0).astype(np.uint8)
-        self._mounts = self._draw_mounts()
-        self._background, self._world = self._make_background(self._draw_world())
+        self._mounts = Mounts(
+            np.array([tag.arc_length for tag in tags.limb]),
+            np.array([tag.height for tag in tags.limb]),
+            np.array([tag.size for tag in tags.limb]),
+            np.array([tag.offset for tag in tags.limb]),
+        )
+        self._background, self._world = self._make_background()
         self._noise_starts = np.zeros(len(tags.limb), dtype=np.int64)
 
     def frame(self, shape: Shape, velocity: Shape | None = None) -> RenderedPicture:
@@ -234,31 +220,8 @@ class SyntheticCamera:
         drawn = self._random.standard_normal(_NOISE_LENGTH, dtype=np.float32) * self.optics.noise
         return np.clip(np.round(drawn), -127, 127).astype(np.int8)
 
-    def _draw_mounts(self) -> Mounts:
-        """Draw where the limb's tags really sit."""
-        scale = (self.errors.mounting, self.errors.mounting, self.errors.mounting_angle)
-        drawn = self._random.standard_normal((len(self.tags.limb), 3)) * scale
-        return Mounts(
-            np.array([tag.arc_length for tag in self.tags.limb]),
-            np.array([tag.height for tag in self.tags.limb]),
-            np.array([tag.size for tag in self.tags.limb]),
-            np.array([tag.offset for tag in self.tags.limb]) + drawn,
-        )
-
-    def _draw_world(self) -> NDArray[np.float64]:
-        """Draw where the fixed tags really are, (n, 5) placements."""
-        placed = np.array([(*tag.position, tag.yaw, tag.size) for tag in self.tags.world])
-        placed = placed.reshape(-1, PLACEMENT)
-        placed[:, :2] += self._random.standard_normal((len(placed), 2)) * self.errors.survey
-        return placed
-
-    def _make_background(
-        self, world: NDArray[np.float64]
-    ) -> tuple[NDArray[np.uint8], dict[int, NDArray[np.float64]]]:
+    def _make_background(self) -> tuple[NDArray[np.uint8], dict[int, NDArray[np.float64]]]:
         """Draw what does not move, without noise: a cloudy floor and the fixed tags.
-
-        Args:
-            world: (n, 5) placements of the fixed tags.
 
         Returns:
             The picture, and the corners of the fixed tags in it by id.
@@ -270,8 +233,9 @@ class SyntheticCamera:
         )
         floor = (120.0 + 6.0 * clouds) * self._eye.light
         image: NDArray[Any] = np.clip(np.round(floor), 0, 255).astype(np.uint8)
-        if not len(world):
+        if not self.tags.world:
             return image, {}
+        world = np.array([(*tag.position, tag.yaw, tag.size) for tag in self.tags.world])
         instants = np.repeat(world[:, None], MOST_INSTANTS, axis=1)
         still = Placements(world, instants, np.ones(len(world), dtype=np.int64))
         tags, silent = self.tags.world, np.zeros(1, dtype=np.int8)
