@@ -124,7 +124,7 @@ class SyntheticCamera:
         self._random = np.random.default_rng(seed)
         self._eye = self._make_eye()
         scale = model.intrinsics.matrix[0, 0] / model.pose.position[2]
-        self._exposure = Exposure.create(max(self.optics.exposure, 0.0), scale)
+        self._exposure = Exposure(0.5 * max(self.optics.exposure, 0.0), scale)
         self._prints = self._print(tags.limb)
         self._noise = self._make_noise()
         # Saturated sums of bytes take a quarter of the time of a sum of bytes and signed noise.
@@ -169,8 +169,7 @@ class SyntheticCamera:
     ) -> dict[int, NDArray[np.float64]]:
         """Draw placed tags; returns the corners of those that are in the picture, by id."""
         starts = self._noise_starts if len(noise) > 1 else np.zeros(len(tags), dtype=np.int64)
-        shares = self._exposure.shares
-        corners, drawn = render.draw_tags(image, self._eye, prints, noise, starts, placed, shares)
+        corners, drawn = render.draw_tags(image, self._eye, prints, noise, starts, placed)
         return {tag.id: corners[k] for k, tag in enumerate(tags) if drawn[k]}
 
     def _draw_body(self, image: NDArray[np.uint8], shape: Shape) -> None:

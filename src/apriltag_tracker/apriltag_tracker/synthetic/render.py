@@ -72,14 +72,12 @@ class Seen(NamedTuple):
     Attributes:
         maps: (k, 9) from rays to cells (column to the right, row downward), one for each instant of
             the exposure.
-        shares: (k,) of the exposure that each instant stands for; they sum to 1.
         across: standard deviation of blur and pixel along the columns of cells [cells].
         down: the same along the rows.
         cells: (n, n) printed cells with their margin, 1 is white.
     """
 
     maps: NDArray[np.float64]
-    shares: NDArray[np.float64]
     across: float
     down: float
     cells: NDArray[np.float64]
@@ -154,8 +152,8 @@ def _draw_box(
         box: first row, end row, first column, end column.
         seen: the tag.
     """
-    cells, maps, shares, table = seen.cells, seen.maps, seen.shares, eye.table
-    count = cells.shape[0]
+    cells, maps, table = seen.cells, seen.maps, eye.table
+    count, share = cells.shape[0], 1.0 / maps.shape[0]
     across, down = np.empty(count), np.empty(count)
     position = noise_start
     for row in range(box[0], box[1]):
@@ -171,12 +169,12 @@ def _draw_box(
                 if wide == 0.0:
                     continue
                 top, bottom, high = _shares(v, seen.down, count, table, down)
-                cover += shares[k] * wide * high
+                cover += share * wide * high
                 for j in range(top, bottom):
                     line = 0.0
                     for i in range(left, right):
                         line += across[i - left] * cells[j, i]
-                    bright += shares[k] * down[j - top] * line
+                    bright += share * down[j - top] * line
             if cover <= 0.0:
                 continue
             value = (eye.black * (cover - bright) + eye.white * bright) * eye.light[row, column]
@@ -255,7 +253,6 @@ def draw_tags(
     noise: NDArray[np.int8],
     noise_starts: NDArray[np.int64],
     placed: Placements,
-    shares: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Draw tags over an exposure.
 
@@ -266,7 +263,6 @@ def draw_tags(
         noise: (m,) grey levels, added to the tags' pixels.
         noise_starts: (n,) places in the noise.
         placed: where the tags are.
-        shares: (k, k) of the exposure that each instant stands for, row `count - 1` for `count`.
 
     Returns:
         True corners (n, 4, 2) px in the middle of the exposure; and whether any of a tag (n,) is in
@@ -294,6 +290,6 @@ def draw_tags(
         other = math.hypot(last[3, 0] - last[0, 0], last[3, 1] - last[0, 1])
         other += math.hypot(last[2, 0] - last[1, 0], last[2, 1] - last[1, 1])
         wide = 2.0 * eye.blur * prints.border
-        seen = Seen(maps[:count], shares[count - 1], wide / side, wide / other, prints.cells[tag])
+        seen = Seen(maps[:count], wide / side, wide / other, prints.cells[tag])
         _draw_box(canvas, eye, noise, noise_starts[tag], box, seen)
     return corners, drawn

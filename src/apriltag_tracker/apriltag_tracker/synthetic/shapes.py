@@ -16,7 +16,8 @@ PLACEMENT = 5
 MOST_INSTANTS = 16
 _STILL, _INSTANTS_APART = 0.2, 1.1
 """Ways during an exposure that are shorter than the first [px] are one instant; longer ones take
-Gauss's instants, about so far apart [px]: of a blurred picture their mean is that of all."""
+even instants, about so far apart [px]: of a blurred picture their mean is that of all, within a
+grey level."""
 
 
 @dataclass(frozen=True)
@@ -108,23 +109,10 @@ class Exposure(NamedTuple):
     Attributes:
         half: of the time a picture takes [s].
         scale: px that a metre takes in the picture.
-        instants: (MOST_INSTANTS, MOST_INSTANTS) Gauss's instants from -1 to 1, row k - 1 for k.
-        shares: the same for the share of the exposure that each of them stands for.
     """
 
     half: float
     scale: float
-    instants: NDArray[np.float64]
-    shares: NDArray[np.float64]
-
-    @classmethod
-    def create(cls, time: float, scale: float) -> Exposure:
-        """Return the exposure that takes a time [s] at a scale [px/m]."""
-        instants, shares = np.zeros((2, MOST_INSTANTS, MOST_INSTANTS))
-        for count in range(1, MOST_INSTANTS + 1):
-            nodes, weights = np.polynomial.legendre.leggauss(count)
-            instants[count - 1, :count], shares[count - 1, :count] = nodes, 0.5 * weights
-        return cls(0.5 * time, scale, instants, shares)
 
 
 class Placements(NamedTuple):
@@ -132,8 +120,8 @@ class Placements(NamedTuple):
 
     Attributes:
         middle: (n, 5) in the middle of it.
-        instants: (n, MOST_INSTANTS, 5) at Gauss's instants.
-        counts: (n,) how many instants there are for each tag.
+        instants: (n, MOST_INSTANTS, 5) at even instants.
+        counts: (n,) how many of these instants count for each tag.
     """
 
     middle: NDArray[np.float64]
@@ -161,6 +149,7 @@ def place_tags(
     travelled = 2.0 * exposure.half * exposure.scale * speed
     steps = np.minimum(1.0 + np.ceil(travelled / _INSTANTS_APART), MOST_INSTANTS)
     counts = np.where(travelled < _STILL, 1, steps.astype(np.int64))
-    times = exposure.half * exposure.instants[counts - 1]
+    middles = 2.0 * np.arange(MOST_INSTANTS) + 1.0
+    times = exposure.half * (middles / counts[:, None] - 1.0)
     during = middle[:, None] + times[:, :, None] * change[:, None]
     return Placements(mounts.placed(middle[:, None])[:, 0], mounts.placed(during), counts)
