@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Pose, PoseArray, PoseStamped, TransformStamped
+from scipy.spatial.transform import Rotation
 
 from apriltag_tracker.bodies.body_map import BodyMap
 from apriltag_tracker.bodies.forms import PoseFormError, message_type, poses_of, topics_of
@@ -51,10 +52,13 @@ def errors(tips, found):
     return np.array([each.followed.estimate.tip for each in found]) - tips
 
 
-@pytest.mark.parametrize(("up", "unit"), [("z", 1.0), ("y", 1e-3), ("x", 1e-2)])
-def test_the_tip_is_found_in_any_frame_and_unit(bodies, swing, up, unit):
-    mapped = dataclasses.replace(bodies, unit=unit)
-    _, tips, found = run(SyntheticMocap(mapped, tilt=0.1, up=up), swing, 10)
+@pytest.mark.parametrize(
+    ("turn", "unit"), [((0.1, 0.0, 0.3), 1.0), ((-1.5, 0.0, 0.3), 1e-3), ((0.1, 1.6, 0.0), 1e-2)]
+)
+def test_the_tip_is_found_in_any_frame_and_unit(bodies, swing, turn, unit):
+    mocap = SyntheticMocap(dataclasses.replace(bodies, unit=unit))
+    mocap.rotation = Rotation.from_rotvec(turn).as_matrix()
+    _, tips, found = run(mocap, swing, 10)
     assert np.abs(errors(tips, found)).max() < 5e-5
     assert all(not each.followed.reason for each in found)
 

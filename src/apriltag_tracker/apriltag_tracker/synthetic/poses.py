@@ -12,11 +12,8 @@ from apriltag_tracker.bodies.body_map import BodyMap
 from apriltag_tracker.bodies.tracker import PoseFrame
 from apriltag_tracker.synthetic.shapes import Shape
 
-UPRIGHT = {"z": (0.0, 0.0, 0.0), "y": (-np.pi / 2, 0.0, 0.0), "x": (0.0, np.pi / 2, 0.0)}
-"""The turn that brings z to each axis, about an axis [rad]."""
-
 TURN = 0.3
-"""Of `limb_base` about the axis that is up, in the frame of the poses [rad]."""
+"""Of `limb_base` about the axis z, which is up, in the frame of the poses [rad]."""
 
 
 @dataclass(frozen=True)
@@ -40,26 +37,14 @@ class SyntheticMocap:
     Args:
         bodies: the body map; poses come in its unit.
         faults: what is wrong with them.
-        tilt: of the plane of motion against the floor [rad].
         seed: of noise and dropouts.
-        up: axis of the poses' frame that points up, of `UPRIGHT`.
     """
 
-    def __init__(
-        self,
-        bodies: BodyMap,
-        faults: MocapFaults | None = None,
-        tilt: float = 0.0,
-        seed: int = 0,
-        up: str = "z",
-    ) -> None:
+    def __init__(self, bodies: BodyMap, faults: MocapFaults | None = None, seed: int = 0) -> None:
         self.bodies, self.faults = bodies, faults or MocapFaults()
         self._random = np.random.default_rng(seed)
-        level = Rotation.from_rotvec(np.array(UPRIGHT[up]))
-        # limb_base in the frame of the poses
-        self.rotation: NDArray[np.float64] = (
-            level * Rotation.from_euler("zx", [TURN, tilt])
-        ).as_matrix()
+        self.rotation: NDArray[np.float64] = Rotation.from_euler("z", TURN).as_matrix()
+        """(3, 3) the axes of `limb_base` in the frame of the poses, as columns."""
         self.origin = np.array([0.4, -0.2, 0.9])
         """Where the clamp is in the frame of the poses [m]."""
 
