@@ -331,6 +331,11 @@ def test_a_topic_of_its_own_names_the_body():
 def test_what_cannot_be_is_refused_with_the_remedy(monkeypatch):
     with pytest.raises(PoseFormError, match="array of 2 poses came, the body map has 1 bodies"):
         list(poses_of("pose_array", MESSAGES["pose_array"], "", NAMES[:1]))
+    message = SimpleNamespace(TFMessage=SimpleNamespace)
+    for module in ("tf2_msgs", "tf2_msgs.msg"):
+        monkeypatch.setitem(sys.modules, module, message)
+    assert message_type("tf") is SimpleNamespace
+    # A module that is None in sys.modules cannot be imported.
     monkeypatch.setitem(sys.modules, "motion_capture_tracking_interfaces.msg", None)
     with pytest.raises(PoseFormError, match="install ros-jazzy-motion-capture-tracking-interfaces"):
         message_type("named_pose_array")

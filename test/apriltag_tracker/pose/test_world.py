@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -15,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from apriltag_tracker.camera import CameraPose, project
 from apriltag_tracker.detection import Tag
-from apriltag_tracker.pose.node import limb_transforms, transform, transforms_type
+from apriltag_tracker.pose.node import limb_transforms, transform
 from apriltag_tracker.pose.shape import centreline_pose
 from apriltag_tracker.pose.world import LASTING_ERROR, WorldPose, locate, planar_poses
 from apriltag_tracker.tag_map import UNIT_CORNERS, LimbTag
@@ -197,13 +195,3 @@ def test_points_of_the_base_are_seen_where_the_camera_sees_them():
     points = np.random.default_rng(2).uniform(-0.2, 0.2, (20, 3))
     inside = (points - matrix(message)[:3, 3]) @ matrix(message)[:3, :3]
     np.testing.assert_allclose(inside, points @ pose.rotation.T + pose.translation, atol=1e-12)
-
-
-def test_transforms_are_told_where_tf2_is_installed(monkeypatch):
-    # A module that is None in sys.modules cannot be imported.
-    monkeypatch.setitem(sys.modules, "tf2_msgs.msg", None)
-    assert transforms_type() is None
-    message = SimpleNamespace(TFMessage=SimpleNamespace)
-    monkeypatch.setitem(sys.modules, "tf2_msgs", message)
-    monkeypatch.setitem(sys.modules, "tf2_msgs.msg", message)
-    assert transforms_type() is SimpleNamespace

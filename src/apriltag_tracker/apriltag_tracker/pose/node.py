@@ -5,9 +5,9 @@ It goes out as `state`, as markers for RViz and Foxglove, and as transforms for 
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
-import importlib
 import math
 import time
 from collections.abc import Iterable, Sequence
@@ -22,13 +22,13 @@ from rclpy.qos import QoSProfile
 from scipy.spatial.transform import Rotation
 from visualization_msgs.msg import Marker, MarkerArray
 
+from apriltag_tracker.bodies.forms import FORMS, PoseFormError, message_type
 from apriltag_tracker.installed import CONFIG
 from apriltag_tracker.pose.shape import FollowerOptions, LimbEstimate
 from der_msgs.msg import LimbState, TagDetection, TagDetectionArray
 from limb_interfaces import qos, stamps, topics
 from limb_interfaces.parameters import declare
 
-TF = "/tf"
 CLAMP_FRAME = "limb_clamp"
 """Name of the frame at the clamped end, which is the origin of `limb_base`."""
 TIP_FRAME = "limb_tip"
@@ -86,9 +86,12 @@ class LimbStateNode(Node):
         self._states = self.create_publisher(LimbState, topics.LIMB_STATE, qos.STATES)
         self._tags = self.create_publisher(TagDetectionArray, topics.TAGS, qos.STATES)
         self._markers = self.create_publisher(MarkerArray, topics.SHAPE_MARKERS, qos.STATES)
-        kind = transforms_type()
-        # The depth is that of tf2_ros.
-        self._transforms = kind and self.create_publisher(kind, TF, QoSProfile(depth=100))
+        self._transforms: Any = None
+        # ROS from apt has `tf2_msgs`, its wheels have not; without it nothing else changes.
+        with contextlib.suppress(PoseFormError):
+            # The depth is that of tf2_ros.
+            kind, depth = message_type("tf"), QoSProfile(depth=100)
+            self._transforms = self.create_publisher(kind, FORMS["tf"].topic, depth)
 
     def publish_state(
         self,
@@ -218,14 +221,3 @@ def limb_transforms(curve: NDArray[np.float64], stamp: Time) -> list[TransformSt
         transform(CLAMP_FRAME, (0.0, 0.0, 0.0), np.eye(3), stamp),
         transform(TIP_FRAME, (*curve[-1].tolist(), 0.0), tip, stamp),
     ]
-
-
-def transforms_type() -> Any:
-    """Return the type of messages on `/tf`; None where `tf2_msgs` is not installed.
-
-    ROS from apt has it, its wheels have not; without it nothing else changes.
-    """
-    try:
-        return importlib.import_module("tf2_msgs.msg").TFMessage
-    except ImportError:
-        return None
