@@ -54,14 +54,6 @@ def test_plane_and_projection_are_inverse():
         assert np.allclose(pose.onto_plane(lens.rays(pixels), height), points, atol=1e-10)
 
 
-def test_camera_that_looks_down_is_where_it_was_put():
-    pose = CameraPose.looking_down((0.1, 0.02, 0.6), 0.7)
-    assert np.allclose(pose.position, (0.1, 0.02, 0.6))
-    assert np.linalg.det(pose.rotation) == pytest.approx(1.0)
-    right = pose.rotation.T @ (1.0, 0.0, 0.0)
-    assert np.allclose(right, (np.cos(0.7), np.sin(0.7), 0.0))
-
-
 def test_a_mirrored_map_is_refused():
     lens = intrinsics([])
     pose = CameraPose.looking_down((0.0, 0.0, 0.8), 0.3)

@@ -206,28 +206,12 @@ def offer(schedule, item, now=NOW):
     return schedule.offer(item, now, ZERO)
 
 
-def test_a_setpoint_waits_for_its_stamp_and_is_then_held():
+def test_a_stamp_between_ticks_takes_effect_at_the_next_one_and_the_later_of_two_stays():
     schedule = SetpointSchedule(Settings())
-    assert offer(schedule, setpoint(3)) is Verdict.ACCEPTED
-    assert [schedule.take(NOW + k * PERIOD) for k in (1, 2)] == [None, None]
-    assert schedule.take(NOW + 3 * PERIOD).differential == (1000.0, -1000.0)
-    assert schedule.take(NOW + 4 * PERIOD) is None
-    assert schedule.current.differential == (1000.0, -1000.0)
-    assert schedule.counts["executed"] == 1
-
-
-def test_a_stamp_between_ticks_takes_effect_at_the_next_one():
-    schedule = SetpointSchedule(Settings())
-    offer(schedule, setpoint(2, offset=1))
+    offer(schedule, setpoint(2, 1000.0, offset=1))
+    offer(schedule, setpoint(3, 2000.0, index=1))
     assert schedule.take(NOW + 2 * PERIOD) is None
-    assert schedule.take(NOW + 3 * PERIOD)
-
-
-def test_two_setpoints_within_one_tick_leave_the_later_one():
-    schedule = SetpointSchedule(Settings())
-    offer(schedule, setpoint(2, 1000.0, offset=-2 * 10**7))
-    offer(schedule, setpoint(2, 2000.0, index=1))
-    assert schedule.take(NOW + 2 * PERIOD).differential[0] == 2000.0
+    assert schedule.take(NOW + 3 * PERIOD).differential[0] == 2000.0
     assert schedule.counts["superseded"] == 1
 
 
