@@ -10,6 +10,7 @@ import pytest
 from sensor_msgs.msg import Image
 from waiting import Clock, wait_for
 
+from apriltag_tracker.camera import images
 from apriltag_tracker.camera.images import (
     DeviceSource,
     ImageError,
@@ -177,7 +178,8 @@ class FakeCamera:
 def test_an_unplugged_camera_is_named_and_comes_back(monkeypatch):
     camera = FakeCamera()
     monkeypatch.setattr(DeviceSource, "_RETRY", 0.01)
-    source = DeviceSource("/dev/video0", 30.0, time.time_ns, lambda _: camera)
+    monkeypatch.setattr(images, "_open_device", lambda _: camera)
+    source = DeviceSource("/dev/video0", 30.0, time.time_ns)
 
     def gone():
         try:

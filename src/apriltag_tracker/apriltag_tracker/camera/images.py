@@ -155,7 +155,7 @@ def open_source(
     """
     path = Path(name)
     if name.isdigit() or name.startswith("/dev/"):
-        return DeviceSource(name, rate, clock, size=size)
+        return DeviceSource(name, rate, clock, size)
     if path.is_dir():
         return _folder_source(path, rate, clock)
     if path.is_file():
@@ -254,14 +254,12 @@ class DeviceSource:
         name: str,
         rate: float,
         clock: Callable[[], int],
-        capture: Callable[[str], Any] | None = None,
         size: tuple[int, int] | None = None,
     ) -> None:
         self._name = name
         self._rate = rate
         self._clock = clock
         self._size = size
-        self._capture = capture or _open_device
         self._video = self._open()
         if not self._video.isOpened():
             raise ImageError(
@@ -290,7 +288,7 @@ class DeviceSource:
         self._video.release()
 
     def _open(self) -> Any:
-        video = self._capture(self._name)
+        video = _open_device(self._name)
         if self._size is not None:
             video.set(cv2.CAP_PROP_FRAME_WIDTH, self._size[0])
             video.set(cv2.CAP_PROP_FRAME_HEIGHT, self._size[1])
