@@ -17,7 +17,6 @@ from apriltag_tracker.camera import CameraError, CameraPose, Intrinsics, project
 from apriltag_tracker.synthetic import render
 from apriltag_tracker.synthetic.shapes import (
     MOST_INSTANTS,
-    Exposure,
     Mounts,
     Placements,
     Shape,
@@ -123,8 +122,7 @@ class SyntheticCamera:
         self.optics = optics or Optics()
         self._random = np.random.default_rng(seed)
         self._eye = self._make_eye()
-        scale = model.intrinsics.matrix[0, 0] / model.pose.position[2]
-        self._exposure = Exposure(0.5 * max(self.optics.exposure, 0.0), scale)
+        self._scale = model.intrinsics.matrix[0, 0] / model.pose.position[2]
         self._prints = self._print(tags.limb)
         self._noise = self._make_noise()
         # Saturated sums of bytes take a quarter of the time of a sum of bytes and signed noise.
@@ -155,7 +153,7 @@ class SyntheticCamera:
         cv2.add(self._background, self._brighter[noise].reshape(rows, columns), image)
         cv2.subtract(image, self._darker[noise].reshape(rows, columns), image)
         self._draw_body(image, shape)
-        placed = place_tags(self._mounts, self._exposure, shape, velocity)
+        placed = place_tags(self._mounts, self.optics.exposure, self._scale, shape, velocity)
         drawn = self._draw_tags(image, self.tags.limb, self._prints, self._noise, placed)
         return RenderedPicture(image, self._world | drawn)
 

@@ -48,14 +48,13 @@ def _tangent(heading: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def constant_curvature(
-    lengths: Sequence[float], bends: Sequence[float], elongation: float = 1.0, points: int = 121
+    lengths: Sequence[float], bends: Sequence[float], points: int = 121
 ) -> Shape:
     """Return a limb whose segments are arcs.
 
     Args:
         lengths: of the segments at rest [m].
         bends: angle each of them turns by [rad].
-        elongation: length over length at rest.
         points: of the whole centreline.
     """
     ends = np.concatenate([[0.0], np.cumsum(lengths)])
@@ -64,7 +63,7 @@ def constant_curvature(
     heading = np.zeros_like(arc_length)
     for k, bend in enumerate(curvature):
         heading += bend * np.clip(arc_length - ends[k], 0.0, lengths[k])
-    return Shape(arc_length, elongation * _integrate(arc_length, heading), heading)
+    return Shape(arc_length, _integrate(arc_length, heading), heading)
 
 
 def _integrate(s: NDArray[np.float64], heading: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -103,18 +102,6 @@ class Mounts(NamedTuple):
         return result
 
 
-class Exposure(NamedTuple):
-    """How a moving limb is seen.
-
-    Attributes:
-        half: of the time a picture takes [s].
-        scale: px that a metre takes in the picture.
-    """
-
-    half: float
-    scale: float
-
-
 class Placements(NamedTuple):
     """Where n tags are during an exposure.
 
@@ -130,13 +117,14 @@ class Placements(NamedTuple):
 
 
 def place_tags(
-    mounts: Mounts, exposure: Exposure, shape: Shape, velocity: Shape | None = None
+    mounts: Mounts, exposure: float, scale: float, shape: Shape, velocity: Shape | None = None
 ) -> Placements:
     """Place the tags of a limb that moves during an exposure.
 
     Args:
         mounts: of the tags.
-        exposure: of the picture.
+        exposure: time that the picture takes [s].
+        scale: px that a metre takes in the picture.
         shape: the limb in the middle of it.
         velocity: its change in a second, in the same arrays; None: it rests.
     """
@@ -146,10 +134,10 @@ def place_tags(
         points, heading = shape.points + velocity.points, shape.heading + velocity.heading
         change = Shape(shape.arc_length, points, heading).at(mounts.arc_length) - middle
     speed = np.hypot(change[:, 0], change[:, 1]) + np.abs(change[:, 2]) * mounts.size
-    travelled = 2.0 * exposure.half * exposure.scale * speed
+    travelled = exposure * scale * speed
     steps = np.minimum(1.0 + np.ceil(travelled / _INSTANTS_APART), MOST_INSTANTS)
     counts = np.where(travelled < _STILL, 1, steps.astype(np.int64))
     middles = 2.0 * np.arange(MOST_INSTANTS) + 1.0
-    times = exposure.half * (middles / counts[:, None] - 1.0)
+    times = 0.5 * exposure * (middles / counts[:, None] - 1.0)
     during = middle[:, None] + times[:, :, None] * change[:, None]
     return Placements(mounts.placed(middle[:, None])[:, 0], mounts.placed(during), counts)
