@@ -12,10 +12,7 @@ from pressure_driver.emulator.line import EmulatedPort
 from pressure_driver.emulator.pneumatics import BoardPneumatics
 from pressure_driver.protocols import (
     BoardFailure,
-    BoardIdentity,
-    Echo,
     SettingError,
-    Telemetry,
     host_protocol,
 )
 from pressure_driver.settings import Settings, TopicBoardSettings
@@ -130,7 +127,6 @@ def test_the_port_overwrites_no_file_and_takes_no_link_from_another_emulator(tmp
     EmulatedPort(first.link).close()
 
 
-ROOM = 101_325.0
 READING = (7_000.0, 0.0, 0.0, 3_000.0)
 
 
@@ -162,18 +158,6 @@ def test_readings_that_are_not_a_number_for_each_chamber_are_refused(told):
 def test_one_topic_for_the_pressures_of_each_chamber_is_refused():
     with pytest.raises(SettingError, match="'measured_topic'"):
         TopicBoardSettings(message="FluidPressure", command_topic="/valve{}/command")
-
-
-def test_setpoints_are_passed_on_and_readings_come_back():
-    bench = Bench()
-    (identity,) = bench.say(bench.host.start(), 0.0)
-    assert isinstance(identity, BoardIdentity)
-    data = bench.host.setpoint([7_000.0, 0.0, 0.0, 3_000.0])
-    assert bench.say(data, 1.0) == [], "nothing has been measured"
-    assert bench.told == [READING]
-    telemetry, echo = bench.host.decode(bench.board.measured(READING, 1.1))
-    assert telemetry == Telemetry(chamber_pressure=tuple(ROOM + value for value in READING))
-    assert echo == Echo(bench.host.number)
 
 
 def test_readings_that_stop_are_not_told_again():
