@@ -50,7 +50,12 @@ from der_planner.planning.timing import (
 )
 from der_planner.planning.workspace import Workspace, check_branch
 
-JOINT_MOTIONS = ("asynchronous", "same_direction", "opposite_direction")
+JOINT_MOTIONS = {
+    "asynchronous": (0.25, 1.0),
+    "same_direction": (0.0, 1.0),
+    "opposite_direction": (0.0, -1.0),
+}
+"""Segment j lags behind the first by j times a share of the period, and has a sign to the j."""
 NAMES = (*JOINT_MOTIONS, *paths.SHAPES)
 DEFAULT_AMPLITUDE = math.pi / 4
 """Largest bend of a segment where none is given [rad]."""
@@ -246,9 +251,9 @@ class Motion:
         total = self.cycles * self.period
         time = fine_grid(total)
         place = np.arange(segments)
-        lag = place * self.period / 4 if self.name == "asynchronous" else 0.0 * place
-        sign = (-1.0) ** place if self.name == "opposite_direction" else 1.0 + 0.0 * place
-        phase = 2 * np.pi * (time[:, None] - lag) / self.period
+        share, alternating = JOINT_MOTIONS[self.name]
+        sign = alternating**place
+        phase = 2 * np.pi * (time[:, None] - place * self.period * share) / self.period
         wave = 0.5 * self.amplitude * sign * (1 - np.cos(phase))
         angles = rest.bend_by_load + wave * smooth_step(time / (self.period / 4))[:, None]
         rate = 2 * np.pi / self.period

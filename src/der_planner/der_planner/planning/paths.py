@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import math
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,7 +18,18 @@ from der_planner.model.bending import Kinematics
 from der_planner.planning.loads import PlanningError
 from der_planner.planning.timing import LONGEST, PathLimits, paced, smooth_step, tip_rates
 
-SHAPES = ("circle", "figure_eight", "line", "star")
+CURVES: dict[str, Callable[[Array], tuple[Array, Array]]] = {
+    "circle": lambda phase: (np.cos(phase), np.sin(phase)),
+    "figure_eight": lambda phase: (np.sin(2 * phase) / 2, np.sin(phase)),
+}
+"""Smooth shapes: x and y over the radius at phases of a cycle [rad]."""
+_STAR = 2 * np.pi * np.arange(6) * 2 / 5
+POLYGONS = {
+    "line": np.array([(0.0, -1.0), (0.0, 1.0), (0.0, -1.0)]),
+    "star": np.column_stack([np.cos(_STAR), np.sin(_STAR)]),
+}
+"""Shapes of straight lines: their corners over the radius."""
+SHAPES = (*CURVES, *POLYGONS)
 """Shapes that the tip can draw."""
 SHAPE_SIZE = 0.04
 """Radius (half length) of a shape over the limb's length, at an amplitude of 45 degrees."""
@@ -182,17 +194,13 @@ def draw_shape(
     heading = float(bend.sum()) / 2
     along = np.array([np.cos(heading), np.sin(heading)])
     axes = radius * np.array([along, [-along[1], along[0]]])
-    if name in ("line", "star"):
-        corners = centre + _corners(name) @ axes
+    if name in POLYGONS:
+        corners = centre + POLYGONS[name] @ axes
         return polygon(np.concatenate([corners] + [corners[1:]] * (cycles - 1)), period * cycles)
     total = period * cycles
     time = np.linspace(0.0, total + period / 4, _SHAPE_POINTS * 4 * cycles + 1)
     phase = 2 * np.pi * _faded_phase(time / period, cycles)
-    if name == "circle":
-        local = np.column_stack([np.cos(phase), np.sin(phase)])
-    else:
-        local = np.column_stack([np.sin(2 * phase) / 2, np.sin(phase)])
-    return TipPath(time, centre + local @ axes)
+    return TipPath(time, centre + np.column_stack(CURVES[name](phase)) @ axes)
 
 
 def _faded_phase(turns: Array, cycles: int) -> Array:
@@ -206,13 +214,6 @@ def _faded_phase(turns: Array, cycles: int) -> Array:
 
     begun = ramp(turns) + np.maximum(turns - fade, 0.0)
     return np.where(turns > total - fade, cycles - ramp(total - turns), begun)
-
-
-def _corners(name: str) -> Array:
-    if name == "line":
-        return np.array([(0.0, -1.0), (0.0, 1.0), (0.0, -1.0)])
-    phase = 2 * np.pi * np.arange(6) * 2 / 5
-    return np.column_stack([np.cos(phase), np.sin(phase)])
 
 
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "s": 1.0, "ms": 0.001}
