@@ -15,18 +15,30 @@ from der_planner.arrays import Array
 from der_planner.identification.least_squares import Unknowns
 from der_planner.limb import Limb, Segment, Term, declarations
 
-GROUPS = ("asymmetry", "stiffening", "cubic", "coupling", "friction", "creep", "dynamics")
-"""Model terms that may be left out, in the order in which they are explained."""
+EXPERIMENTS = {
+    "linear": "slow pressures both ways on each segment, in the units of the log,",
+    "asymmetry": "slow pressures both ways on each segment",
+    "stiffening": "slow pressures up to the limit",
+    "cubic": "slow pressures up to the limit",
+    "coupling": "pressures on each segment alone",
+    "friction": "slow strokes of a few degrees, there and back,",
+    "creep": "pressures that are held for a minute",
+    "dynamics": "swings while all segments bend on in one direction, or a weight (--weight),",
+    "mass": "a scale (--mass)",
+}
+"""Groups of model terms in the order in which they are explained; what tells each where a log does
+not, as the subject of a sentence."""
 OPTIONAL = ("mass",)
 """Model terms that are fitted only on request: the mass, in place of the stiffness. A log without
 measured forces shows only ratios of stiffness, gain and mass, so one of them must be given."""
-_ORDER = ("linear", *GROUPS, *OPTIONAL)
+GROUPS = tuple(name for name in EXPERIMENTS if name not in ("linear", *OPTIONAL))
+"""Model terms that may be left out."""
 _DECLARED = {key: item for key, item in declarations(Segment).items() if item.fit}
 _FIELDS = {item.fit.name: key for key, item in _DECLARED.items() if item.fit}
 TERMS: tuple[Term, ...] = tuple(
     sorted(
         (item.fit for item in _DECLARED.values() if item.fit),
-        key=lambda term: (_ORDER.index(term.group), term.relative),
+        key=lambda term: (list(EXPERIMENTS).index(term.group), term.relative),
     )
 )
 """Terms of each segment, as the fields of `Segment` declare them, by group. Damping by the air and

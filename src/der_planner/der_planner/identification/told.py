@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from der_planner.arrays import Array
 from der_planner.identification.bends import BendFit
 from der_planner.identification.report import Unknown, readable
-from der_planner.identification.terms import FreeTerms, terms_of
+from der_planner.identification.terms import EXPERIMENTS, FreeTerms, terms_of
 from der_planner.limb import Term
 
 Mask = NDArray[np.bool_]
@@ -24,18 +24,6 @@ STIFFNESS_ERROR = 0.08
 ANOTHER_STIFFNESS = 3.0, math.log(1.5)
 """Differences of the logarithm of a stiffness by a known weight from that by motion beyond which
 one of them is wrong: over their standard deviation, and as it is. Both must be passed."""
-EXPERIMENTS = {
-    "linear": "slow pressures both ways on each segment, in the units of the log,",
-    "asymmetry": "slow pressures both ways on each segment",
-    "stiffening": "slow pressures up to the limit",
-    "cubic": "slow pressures up to the limit",
-    "coupling": "pressures on each segment alone",
-    "friction": "slow strokes of a few degrees, there and back,",
-    "creep": "pressures that are held for a minute",
-    "dynamics": "swings while all segments bend on in one direction, or a weight (--weight),",
-    "mass": "a scale (--mass)",
-}
-"""What tells the terms of a group where a log does not, as the subject of a sentence."""
 
 
 def untold_stiffness(free: FreeTerms, unknowns: Sequence[Unknown]) -> tuple[Mask, str]:
