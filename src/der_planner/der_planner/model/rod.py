@@ -35,6 +35,7 @@ from der_planner.model.bending import (
 )
 from der_planner.model.model import NODES, Model, Outputs, Rollout, State
 from der_planner.rod import ConvergenceError, Rod, RodState
+from der_planner.rod.backend import positions_of
 from der_planner.rod.integration import Linearisation
 
 _ITERATIONS = 30
@@ -188,7 +189,7 @@ class Balance:
         normal = self.kinematics.edge_normals(q) / mesh.rest[:, None]
         pair = couple[..., None] * normal
         force = mesh.swung_node_mass[:, None] * acceleration
-        force -= mesh.node_mass[:, None] * mesh.gravity[:2]
+        force -= positions_of(mesh.weight)[:, :2]
         force += mesh.node_damping[:, None] * velocity
         force[:, 1:] += pair
         force[:, :-1] -= pair
