@@ -43,6 +43,19 @@ class Plant(Protocol):
         """(2,) [m]."""
 
 
+class Controller(Protocol):
+    """What corrects a plan while it is played, as `Feedback` does; times count from its start."""
+
+    def pressures(self, time: float, differential: Array) -> None:
+        """Take in what the chambers hold (M,) [Pa]."""
+
+    def measure(self, time: float, bend_angle: Array, tip: Array, covariance: Array) -> None:
+        """Take in (M,) [rad] and (2,) [m] from a picture, late, with (M + 2, M + 2) of both."""
+
+    def command(self, time: float) -> Array:
+        """Return the command (M,) [Pa] from an instant on for 50 ms; asked for ahead, in order."""
+
+
 @dataclass(frozen=True)
 class Sensors:
     """What camera and board show, and when it is known.
@@ -82,7 +95,7 @@ class Played:
         tip: (K, 2) true one [m].
         reference: (K, 2) r̄ [m].
         correction: (K, M) what feedback added to the plan's commands [Pa].
-        estimated_tip: (K, 2) as estimated at its own instant [m]; NaN without feedback.
+        estimated_tip: (K, 2) as `Feedback` estimated it at its own instant [m]; else NaN.
     """
 
     time: Array
@@ -104,7 +117,7 @@ class Played:
 def play(
     plan: Plan,
     plant: Plant,
-    feedback: Feedback | None = None,
+    feedback: Controller | None = None,
     sensors: Sensors | None = None,
     event: Callable[[float], None] = lambda _time: None,
 ) -> Played:
@@ -113,7 +126,7 @@ def play(
     Args:
         plan: to play.
         plant: at rest.
-        feedback: of the plan.
+        feedback: of the plan, or a controller of one's own.
         sensors: what it is told.
         event: called at every instant of a command or a picture, before the limb moves on.
     """
@@ -135,7 +148,9 @@ def play(
         if told is not None:
             told.inform(instant)
         commands.append(command(k + ahead))
-        estimated = np.full(2, np.nan) if feedback is None else feedback.estimate(instant).tip
+        estimated = np.full(2, np.nan)
+        if isinstance(feedback, Feedback):
+            estimated = feedback.estimate(instant).tip
         # A plant may change its own arrays in place.
         state = map(np.array, (plant.differential_pressure, plant.bend_angles, plant.tip))
         rows.append((commands[k], *state, estimated))
@@ -179,7 +194,7 @@ def _advance(
 class _Told:
     """Tells feedback what camera and board show of a plant: with noise, and pictures late."""
 
-    def __init__(self, plant: Plant, feedback: Feedback, sensors: Sensors, segments: int) -> None:
+    def __init__(self, plant: Plant, feedback: Controller, sensors: Sensors, segments: int) -> None:
         self._plant, self._feedback, self._sensors = plant, feedback, sensors
         self._draw = np.random.default_rng([47, sensors.seed])
         self._pictures: list[tuple[float, float, Array, Array]] = []
