@@ -1,9 +1,8 @@
 """The rod of a limb as a model, its balance of forces, and the poses in which pressures hold it.
 
-`Balance` goes from a motion to the pressures that it needs, by two inverses of M q̈ + D q̇ − F_int −
-F_ext = B(q) Λ u, the rod's equation of motion, for configurations q̄ of evenly bent segments: the
-paper's, (B Λ)† on the free rows, and the projection on the tangent S = ∂q̄/∂(bend angles), Sᵀ B Λ u
-= Sᵀ(…) (virtual work).
+`Balance` goes from a motion to the pressures that it needs. It projects the rod's equation of
+motion, M q̈ + D q̇ − F_int − F_ext = B(q) Λ u, for configurations q̄ of evenly bent segments on the
+tangent S = ∂q̄/∂(bend angles): Sᵀ B Λ u = Sᵀ(…) (virtual work).
 
 Under gravity a rod that its pressures hold does not bend evenly. `PoseFinder` finds its resting
 shape q(w) under effective pressures w by Newton's method, and w from the wanted tip r by damped
@@ -163,20 +162,6 @@ class Balance:
         pressures: Array = load / self.moment_gain
         return pressures
 
-    def paper(self, q: Array, v: Array, a: Array) -> tuple[Array, Array]:
-        """Return (K, M) pressures [Pa] from (B Λ)† (M q̈ + D q̇ − F_int − F_ext) on the free rows.
-
-        Also (B Λ)† (K, M, 2(N−1)) [Pa/N] on the free rows, those of nodes 1 … N−1.
-
-        Args:
-            q: (K, M) bend angles of evenly bent segments [rad].
-            v: their rates [rad/s].
-            a: their accelerations [rad/s²].
-        """
-        force = self._needed_force(q, v, a)[:, 1:].reshape(len(q), -1)
-        inverse = np.asarray(np.linalg.pinv(self._input_matrix(q)), dtype=np.float64)
-        return np.einsum("kmf,kf->km", inverse, force), inverse
-
     def _needed_force(self, q: Array, v: Array, a: Array) -> Array:
         """Return M q̈ + D q̇ − F_int − F_ext (K, N, 2) of evenly bent configurations [N].
 
@@ -209,19 +194,6 @@ class Balance:
         ahead = np.concatenate([moment[:, 1:], np.zeros((len(q), 1))], axis=1)
         couples: Array = moment - ahead
         return couples
-
-    def _input_matrix(self, q: Array) -> Array:
-        """Return B Λ (K, 2(N−1), M) [N/Pa] on the free rows, those of nodes 1 … N−1."""
-        rest = self.rod.rest_lengths
-        normal = self.kinematics.edge_normals(q)
-        matrix = np.zeros((len(q), len(rest) + 1, 2, self.rod.segment_count))
-        for j, (first, count) in enumerate(self.rod.segments):
-            for edge, sign in ((first, -1.0), (first + count - 2, 1.0)):
-                # A couple about z on an edge: −n̂/|ē| times itself behind, +n̂/|ē| ahead.
-                pair = sign * self.moment_gain[j] * normal[:, edge] / rest[edge]
-                matrix[:, edge, :, j] -= pair
-                matrix[:, edge + 1, :, j] += pair
-        return matrix[:, 1:].reshape(len(q), -1, self.rod.segment_count)
 
 
 # Poses under gravity ---------------------------------------------------------------------------

@@ -53,7 +53,7 @@ from der_planner.planning.workspace import (
     UnreachableError,
     Workspace,
 )
-from der_planner.rod import RodState
+from der_planner.rod import Rod, RodState
 
 METHODS = {"der": ("paper", "projected", "optimal"), "pcc": ("paper", "projected", "optimal")}
 """The methods of each model. Arcs have one unknown a pressure: their two balances are the same."""
@@ -218,15 +218,14 @@ class RodConfiguration(Configuration):
 
     def pressures(self, method: str, time: Array) -> Array:
         """Return effective pressures (K, M) [Pa], see `Configuration.pressures`."""
-        q, v, a = sample_spline(self.bend, time)
-        balance = self.model.balance
+        bend = sample_spline(self.bend, time)
         if method != "paper":
-            return balance.projected(q, v, a)
-        # (B Λ)† (M q̄̈ + D q̄̇ − F_int − F_ext)
-        placed, moving, _ = self.model.kinematics.motion(q, v, a)
-        position, velocity = coordinates(placed), coordinates(moving)
-        pressures, inverse = balance.paper(q, v, a)
-        return self._beside_the_model(pressures, inverse, position, velocity, time)
+            return self.model.balance.projected(*bend)
+        q, v, a = (coordinates(part) for part in self.model.kinematics.motion(*bend))
+        rod, rest = self.model.rod, self.model.rest
+        moving = [rod.state(place, rate, like=rest) for place, rate in zip(q, v, strict=True)]
+        pressures, inverse = _least_squares(*_equation_of_motion(rod, moving, a))
+        return self._beside_the_model(pressures, inverse, q, v, time)
 
     def _beside_the_model(
         self, pressures: Array, inverse: Array, position: Array, velocity: Array, time: Array
@@ -315,24 +314,42 @@ class LoadedConfiguration(RodConfiguration):
 
     def pressures(self, method: str, time: Array) -> Array:
         """Return effective pressures (K, M) [Pa] along the poses, see the module."""
-        rod, free = self.model.rod, self.model.rod.free
         _, v, a = sample_spline(self._shape, self._time)
         moving = [replace(s, v=rate) for s, rate in zip(self._poses.states, v, strict=True)]
-        # M q̄̈ + D q̄̇ − F_int − F_ext (K, F) [N] and B Λ (K, F, M) [N/Pa] at the poses.
-        inputs = np.array([rod.input_matrix(state)[free] for state in moving])
-        supplied = np.array([rod.internal_force(state) for state in moving]) + rod.external_force
-        forces = (rod.mass_diagonal * a + rod.damping_diagonal * v - supplied)[:, free]
+        forces, inputs = _equation_of_motion(self.model.rod, moving, a)
         if method != "paper":
             work = np.einsum("kfm,kf->km", self._poses.tangents, forces)
             by_pressure = np.einsum("kfm,kfn->kmn", self._poses.tangents, inputs)
             found = np.linalg.solve(by_pressure, work[..., None])[..., 0]
             return interpolate_smoothly(time, self._time, found)
-        inverse = np.asarray(np.linalg.pinv(inputs), dtype=np.float64)
-        found = (inverse @ forces[..., None])[..., 0]
+        found, inverse = _least_squares(forces, inputs)
         pressures = interpolate_smoothly(time, self._time, found)
         nearest = np.rint(np.interp(time, self._time, np.arange(len(self._time)))).astype(int)
         position, velocity, _ = sample_spline(self._shape, time)
         return self._beside_the_model(pressures, inverse[nearest], position, velocity, time)
+
+
+def _equation_of_motion(
+    rod: Rod, moving: list[RodState], acceleration: Array
+) -> tuple[Array, Array]:
+    """Return M q̈ + D q̇ − F_int − F_ext (K, F) [N] and B Λ (K, F, M) [N/Pa] on the free rows.
+
+    Args:
+        rod: of the states.
+        moving: K states.
+        acceleration: (K, 4N-1) q̈.
+    """
+    velocity = np.array([state.v for state in moving])
+    supplied = np.array([rod.internal_force(state) for state in moving]) + rod.external_force
+    forces = rod.mass_diagonal * acceleration + rod.damping_diagonal * velocity - supplied
+    inputs = np.array([rod.input_matrix(state)[rod.free] for state in moving])
+    return forces[:, rod.free], inputs
+
+
+def _least_squares(forces: Array, inputs: Array) -> tuple[Array, Array]:
+    """Return the paper's pressures (K, M) [Pa], (B Λ)† times the forces, and (B Λ)† (K, M, F)."""
+    inverse = np.asarray(np.linalg.pinv(inputs), dtype=np.float64)
+    return (inverse @ forces[..., None])[..., 0], inverse
 
 
 def interpolate_smoothly(time: Array, instants: Array, values: Array) -> Array:
