@@ -114,6 +114,24 @@ def test_a_force_that_noise_hardly_lets_tell_is_not_taken_for_a_large_one(model)
     assert np.nanmedian(forces) == pytest.approx(0.15, rel=0.4)
 
 
+def test_a_force_at_the_tip_is_found_there_though_noise_leaves_other_places(model):
+    felt, draw = lacking(model, {20: (0.0, -0.3)}), np.random.default_rng(6)
+    places, spread = np.linspace(0.0, LIMB.length, 61)[1:], np.diag(DEVIATION**2)
+    noises = draw.multivariate_normal(np.zeros(4), spread, 50)
+    each = [replace(felt, value=felt.value + noise, covariance=spread) for noise in noises]
+    found = [locate(model, one, places).place for one in each]
+    assert np.nanmedian(found) > 0.98 * LIMB.length
+
+
+def test_a_force_counts_by_the_stiffness_that_swings_told(model):
+    felt, places = lacking(model, {20: (0.0, -0.3)}), np.linspace(0.0, LIMB.length, 61)[1:]
+    own = [segment.bending_stiffness for segment in LIMB.segments]
+    softer = replace(LIMB.calibrated, bending_stiffness=tuple(0.8 * value for value in own))
+    known = RodModel(replace(LIMB, calibrated=softer))
+    sizes = [np.linalg.norm(locate(each, felt, places).force) for each in (model, known)]
+    assert sizes[1] == pytest.approx(0.8 * sizes[0], rel=0.02)
+
+
 def test_a_limb_file_that_knows_the_free_level_makes_a_first_run_feel_more(model):
     covered = replace(LIMB.calibrated, differential_pressure=(1e4, 1e4))
     bare = replace(LIMB, calibrated=covered)

@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +15,8 @@ from der_planner.identification.excitation import PERIOD, calibration_run, steps
 from der_planner.identification.log import Prepared, prepare
 from der_planner.identification.report import FitReport, Unknown
 from der_planner.identification.stiffness import HungWeight, stiffness_in_motion
-from der_planner.identification.told import against_motion
+from der_planner.identification.terms import FreeTerms, values_of
+from der_planner.identification.told import against_motion, measured_stiffness
 from der_planner.limb import Limb, Pneumatics, PointMass
 from der_planner.model import RodModel
 from der_planner.model.air import Air, pair_of
@@ -98,6 +100,17 @@ def test_a_weight_that_contradicts_the_motion_is_named():
     assert "stiffness[0] is 2.00 times" in said[0]
     assert not list(against_motion(moved, np.log([1.3, 0.5]), np.array([0.1, 0.1])))
     assert not list(against_motion(moved, np.array([2.0, 2.0]), np.full(2, np.inf)))
+
+
+def test_forces_count_by_the_stiffness_that_was_measured_and_else_by_the_fit_s():
+    free = FreeTerms.of(LIMB, {"gain", "log_stiffness"})
+    measured = free.told("log_stiffness", np.log([0.8, 1.0]), np.array([0.02, np.inf]))
+    values = measured.at_places(values_of(LIMB))
+    values[[term.name == "log_stiffness" for term in free.terms]] = np.log([1.1, 1.2])
+    first, second = measured_stiffness(SimpleNamespace(free=measured), values)
+    own = LIMB.segments[0].bending_stiffness
+    assert first == pytest.approx(0.8 * own, rel=0.01)
+    assert second == pytest.approx(1.2 * own)
 
 
 def test_stiffness_is_found_though_friction_stops_each_swing():

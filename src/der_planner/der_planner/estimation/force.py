@@ -10,8 +10,12 @@ of bend and tip by the force, C_w of the bend by pressure, and J = ∂tip/∂θ 
 These are M + 2 numbers for the three unknowns of a force in the plane. They hardly show the part of
 a force that acts along the limb. What touches the limb from its side pushes across it, with some
 friction: the part along the limb is therefore expected to be a share of the part across it. For
-each place the most likely force follows from linear equations. The likelihood of all places, each
-with its force, then gives place and force, with their deviations.
+each place the most likely force follows from linear equations. The most likely place and its force
+are told; the likelihood of all places, each with its force, gives their deviations.
+
+Without gravity pressures and bends tell only the ratio of gain and stiffness, and forces count as
+stiffness does. Where a limb's swings told it (`CalibratedRange.bending_stiffness`), they count by
+that.
 """
 
 from __future__ import annotations
@@ -117,10 +121,12 @@ def locate(model: RodModel, lacking: Lacking, places: Array) -> Touch:
     likely -= np.log(np.hypot(np.linalg.norm(forces, axis=1), _LEAST_ALONG * usual))
     share = np.exp(likely - likely.max())
     share /= share.sum()
-    place = float(share @ places)
+    # The mean of all places would never lie at the tip.
+    best = int(np.argmax(share))
+    place = float(places[best])
     deviation = float(np.sqrt(share @ (places - place) ** 2 + (places[1] - places[0]) ** 2 / 12))
     turned = np.einsum("pab,pb->pa", axes, forces)
-    force = share @ turned
+    force = turned[best]
     apart = turned - force
     spread = axes @ np.linalg.inv(told) @ np.swapaxes(axes, 1, 2)
     spread = spread + apart[:, :, None] * apart[:, None, :]
@@ -143,6 +149,10 @@ def effects(model: RodModel, bend_angles: Array, places: Array) -> Array:
     limp = compliance(model, bend_angles, places)
     jacobian = model.kinematics.tip_jacobians(bend_angles)
     lacking = np.linalg.solve(limp.bend_by_pressure, limp.bend)
+    stiffer = model.limb.calibrated.bending_stiffness
+    if len(stiffer) == model.inputs:
+        own = np.array([segment.bending_stiffness for segment in model.limb.segments])
+        lacking *= (own / stiffer)[:, None]
     return np.concatenate([lacking, limp.tip - jacobian @ limp.bend], axis=1)
 
 

@@ -45,6 +45,7 @@ from der_planner.identification.told import (
     against_motion,
     at_bounds,
     kept_unknowns,
+    measured_stiffness,
     told,
     untold_stiffness,
 )
@@ -426,6 +427,7 @@ def _calibrated(fitted: _Fitted, prior: Limb, air: AirFit | None, recorded: Prep
         calibrated=CalibratedRange(
             tuple(float(v) for v in np.abs(recorded.pressure[rows]).max(axis=0)),
             tuple(float(v) for v in np.abs(recorded.bend[rows]).max(axis=0)),
+            bending_stiffness=measured_stiffness(fitted.problem, fitted.values),
         ),
         provenance={
             "source": recorded.log.source,

@@ -99,6 +99,26 @@ def _name(term: Term, segment: int) -> str:
     return term.name if term.shared else f"{term.name}[{segment}]"
 
 
+def measured_stiffness(problem: BendFit, values: Array) -> tuple[float, ...]:
+    """Return the stiffness of the segments by what measured it, else by the fit [N·m²].
+
+    A fit takes some friction and creep for stiffness, which its plans need and a force does not.
+
+    Args:
+        problem: that was solved.
+        values: (P,) found.
+    """
+    free = problem.free
+    before = terms_of(free.limb)
+    stiffness = [segment.bending_stiffness for segment in free.limb_with(values).segments]
+    for (segment, column), term, value, prior in zip(
+        free.places, free.terms, values, free.unknowns.prior, strict=True
+    ):
+        if term.name == "log_stiffness" and term.spread < before[column].spread:
+            stiffness[segment] *= math.exp(prior - value)
+    return tuple(stiffness)
+
+
 def told(problem: BendFit, values: Array) -> tuple[tuple[Unknown, ...], Array]:
     """Return the unknowns with standard deviations, and their correlation (P, P).
 

@@ -273,6 +273,14 @@ class CalibratedRange:
         "leave it empty: it is noted where a run is mounted otherwise than the limb file",
         default=(),
     )
+    bending_stiffness: tuple[float, ...] = parameter(
+        "N·m²",
+        "stiffness that swings or a known weight told, by which the force of a touch counts; "
+        "empty: the segments' own",
+        "the calibration writes it",
+        default=(),
+        interval="(0, inf)",
+    )
     free_level: str = parameter(
         "-",
         "numbers of what the model lacks while nothing touches the limb",
