@@ -3,6 +3,7 @@
 (() => {
   const SLOW = 1.5; // s since the server was last heard, up to which a connection is slow and not dead
   const { find, put } = page;
+  const LINE = find("alarm").firstElementChild;
   const rounded = (value) => value.toFixed(1).replace(/^-(0\.0)$/, "$1");
   const ago = (age) => `${age.toFixed(age < 10 ? 1 : 0)} s`;
 
@@ -10,23 +11,22 @@
     const driver = page.ageOf("driver") === null ? null : page.data.driver;
     const old = lost || page.isOld("driver");
     const known = page.data?.alarms ?? [], slow = lost && page.data && unheard <= SLOW;
-    if (slow) showAlarms([...known, ofServer(silence, unheard, driver)], silence); // what is dead stays so
-    else showAlarms(lost ? [ofServer(silence, unheard, driver)] : known, silence);
+    if (slow) showAlarms([...known, ofServer(unheard, driver)], silence); // what is dead stays so
+    else showAlarms(lost ? [ofServer(unheard, driver)] : known, silence);
     showState(driver, old);
   });
 
   // What is wrong with the page itself, which only this window can tell.
-  function ofServer(silence, unheard, driver) {
+  function ofServer(unheard, driver) {
     if (!page.data) return { level: "notice", text: "Waiting for the page's server…" };
-    if (unheard <= SLOW) {
-      return { level: "notice", text: `The connection is slow: what is shown below was so ${ago(silence)} ago.` };
-    }
+    if (unheard <= SLOW) return { level: "notice", text: "The connection is slow: what is shown below is old", since: 0 };
     const limb = driver
-      ? `When last heard, ${ago(page.ageOf("driver"))} ago, the limb was ${page.data.limb_is}, in mode ${driver.mode}`
+      ? `When last heard, the limb was ${page.data.limb_is}, in mode ${driver.mode}`
       : "Nothing is known of the limb";
     return {
       level: "danger",
-      text: `No connection to the page's server for ${ago(silence)}: nothing below is live. ${limb}`,
+      text: `No connection to the page's server: nothing below is live. ${limb}`,
+      since: 0,
       advice: "VENT may not reach it from here: close the valve at the air supply; if the page was started again, open the address that it prints",
     };
   }
@@ -35,11 +35,12 @@
     const place = find("alarm");
     while (place.children.length > alarms.length) place.lastChild.remove();
     alarms.forEach((alarm, index) => {
-      const line = place.children[index] ?? place.appendChild(document.createElement("div"));
+      const line = place.children[index] ?? place.appendChild(LINE.cloneNode(true));
       const since = alarm.since == null ? "" : ` (for ${ago(alarm.since + Math.max(silence, 0))})`;
       const advice = alarm.advice ? ` → ${alarm.advice[0].toUpperCase()}${alarm.advice.slice(1)}` : ""; // no full stop: it may end with a command
       const full = alarm.text.endsWith("…") || alarm.text.endsWith(".") ? "" : ".";
-      put(line, `${alarm.text}${since}${full}${advice}`); // as text, never as HTML
+      // As text, never as HTML. The time is hidden from screen readers: they would read the alarm anew with each change.
+      [alarm.text, since, `${full}${advice}`].forEach((text, part) => put(line.children[part], text));
       if (line.className !== alarm.level) line.className = alarm.level;
     });
     const height = `${find("notices").offsetHeight}px`; // it must cover nothing
