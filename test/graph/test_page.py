@@ -32,6 +32,12 @@ for (const row of document.querySelectorAll("#nodes tr")) {
 const vent = document.getElementById("vent").getBoundingClientRect();
 return [Math.max(vent.right, document.documentElement.scrollWidth), vent.bottom];
 """
+BETWEEN = """
+const [notices, alarm, bar] = ["notices", "alarm", "bar"].map((id) => document.getElementById(id));
+alarm.innerHTML = `<div class="danger">${"The driver is dead. ".repeat(20)}</div>`;
+return bar.getBoundingClientRect().top - notices.getBoundingClientRect().bottom;
+"""
+"""Returns how much of the page is seen beside an alarm [px]."""
 HEAR = """
 window.heard = [];
 const read = (changes) => changes.filter((one) => !one.target.closest("[aria-hidden]"));
@@ -137,13 +143,18 @@ def test_one_arms_and_everybody_vents(rig: WatchedPage) -> None:
     rig.wait_mode(PressureState.DISARMED)
 
 
-def test_long_rows_do_not_push_vent_off_a_telephone(rig: WatchedPage) -> None:
+def test_a_telephone_shows_vent_beside_long_rows_and_the_page_beside_an_alarm(
+    rig: WatchedPage,
+) -> None:
     browser = rig.open()
     telephone = {"width": 320, "height": 568, "deviceScaleFactor": 1, "mobile": True}
     browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", telephone)
     rig.wait(lambda: browser.find_elements("css selector", "#nodes td"), "the nodes")
     right, bottom = browser.execute_script(LONG_ROWS)
     assert (right <= 320, bottom <= 568) == (True, True)
+    at_fourfold_zoom = {**telephone, "height": 190}
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", at_fourfold_zoom)
+    assert browser.execute_script(BETWEEN) > 60
 
 
 def hold(rig: WatchedPage, browser: Any) -> None:
