@@ -58,7 +58,7 @@ class DrawingPanel:
             ui.button("Show", on_click=self._on_load).props('id="load-drawing" flat')
             self._title = ui.input("Name of the drawing").classes("drawing-name")
             ui.button("Keep", on_click=self._on_save).props('id="save-drawing" flat')
-        self._result = ui.label().props('id="preview"')
+        self._result = ui.label().props('id="preview" role="status"')
         ui.on("drawn", self._on_drawn)
 
     @property

@@ -224,7 +224,7 @@ def add_setup_guide(parts: Parts) -> None:
         ui.add_head_html('<link rel="stylesheet" href="/static/page.css">')
         add_frame(client)
         guide = SetupGuide(parts.previewer.limb.segment_count)
-        with ui.element("main").props('id="setup"') as main:
+        with ui.element("div").props('id="setup"') as main:
             ui.html(f"<h2>First power-up of {parts.situation.namespace}</h2>", sanitize=False)
             ui.label("From top to bottom; every step is checked twice a second.")
             shown: list[tuple[ui.step, ui.label]] = []

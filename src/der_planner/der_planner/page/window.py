@@ -66,7 +66,7 @@ class OperatorWindow:
         self._reasons: dict[str, str] = {}
         ui.add_head_html('<link rel="stylesheet" href="/static/page.css">')
         add_frame(client)
-        with ui.element("main").props('id="panels"'):
+        with ui.element("div").props('id="panels"'):
             with ui.element("section").props('id="act"'):
                 self._add_desk()
             with self._panel("view", "Camera", "camera"):
@@ -94,7 +94,7 @@ class OperatorWindow:
             self._add_button("Arm", "arm", lambda: self._call("arm"), "positive")
             self._add_button("Stop motion", "stop", lambda: self._call("stop"), "warning")
             ui.link("Set-up guide", SETUP_ADDRESS, new_tab=True)
-            self._who = ui.label().props('id="who"')
+            self._who = ui.label().props('id="who" role="status"')
 
     def _add_controls(self) -> None:
         with ui.row().classes("line"):
