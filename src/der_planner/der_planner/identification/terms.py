@@ -90,6 +90,13 @@ class FreeTerms:
         known = [(term.spread, term.low, term.high, term.scale) for term in self.terms]
         return Unknowns(self.at_places(self.values), *np.reshape(known, (-1, 4)).T)
 
+    @property
+    def measured(self) -> NDArray[np.bool_]:
+        """Which terms (P,) something else than the log has measured, see `told`."""
+        before = terms_of(self.limb)
+        known = [before[column].spread for _, column in self.places]
+        return np.asarray(self.unknowns.spread < np.array(known))
+
     def only(self, chosen: NDArray[np.bool_]) -> FreeTerms:
         """Return those of the terms that are chosen (P,)."""
         places, terms = compress(self.places, chosen), compress(self.terms, chosen)

@@ -109,14 +109,8 @@ def measured_stiffness(problem: BendFit, values: Array) -> tuple[float, ...]:
         values: (P,) found.
     """
     free = problem.free
-    before = terms_of(free.limb)
-    stiffness = [segment.bending_stiffness for segment in free.limb_with(values).segments]
-    for (segment, column), term, value, prior in zip(
-        free.places, free.terms, values, free.unknowns.prior, strict=True
-    ):
-        if term.name == "log_stiffness" and term.spread < before[column].spread:
-            stiffness[segment] *= math.exp(prior - value)
-    return tuple(stiffness)
+    best = free.limb_with(np.where(free.measured, free.unknowns.prior, values))
+    return tuple(segment.bending_stiffness for segment in best.segments)
 
 
 def told(problem: BendFit, values: Array) -> tuple[tuple[Unknown, ...], Array]:
@@ -135,8 +129,7 @@ def told(problem: BendFit, values: Array) -> tuple[tuple[Unknown, ...], Array]:
     stiff = [term.name == "log_stiffness" for term in free.terms]
     spread = np.array([before[place].spread for _, place in free.places])
     # Friction and creep of slow motion tell another stiffness than swings or a weight do.
-    measured = free.unknowns.spread < spread
-    apart = np.where(measured, np.abs(values - free.unknowns.prior), 0.0)
+    apart = np.where(free.measured, np.abs(values - free.unknowns.prior), 0.0)
     least = np.where(stiff, np.maximum(apart, STIFFNESS_ERROR), 0.0)
     unknowns = tuple(
         Unknown(
