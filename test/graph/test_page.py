@@ -228,6 +228,7 @@ def test_what_died_is_not_shown_as_live_and_a_page_that_hangs_or_dies_vents(
     rig.driver.signal(signal.SIGKILL)
     wait(old, "the driver's death")
     wait(notice("The driver is dead: its process has ended"), "the alarm to say why")
+    assert browser.title.startswith("ALARM: ")
     wait(notice("--params-file"), "the command that starts it again")
     assert "limb was without pressure, in mode disarmed" in browser.find_element("id", "alarm").text
     browser.find_element("id", "vent").click()

@@ -5,6 +5,7 @@
   const { find, put } = page;
   const LINE = find("alarm").firstElementChild;
   const rounded = (value) => value.toFixed(1).replace(/^-(0\.0)$/, "$1");
+  const TITLE = document.title;
   const ago = (age) => `${age.toFixed(age < 10 ? 1 : 0)} s`;
 
   page.onState.push((silence, lost, unheard) => {
@@ -43,6 +44,8 @@
       [alarm.text, since, `${full}${advice}`].forEach((text, part) => put(line.children[part], text));
       if (line.className !== alarm.level) line.className = alarm.level;
     });
+    const title = alarms.some((alarm) => alarm.level === "danger") ? `ALARM: ${TITLE}` : TITLE; // for who has another tab before them
+    if (document.title !== title) document.title = title;
     const height = `${find("notices").offsetHeight}px`; // it must cover nothing
     if (document.body.style.paddingTop !== height) document.body.style.paddingTop = height;
   }
