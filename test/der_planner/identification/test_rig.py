@@ -144,13 +144,16 @@ def test_what_is_broken_is_named(straight):
     leaking = straight.measured.copy()
     rest = leaking[:20, 2].mean()
     leaking[:, 2] = rest + 0.8 * (leaking[:, 2] - rest)
-    found = find_rig(dataclasses.replace(straight, measured=leaking))
-    assert any("valve 3: it leaks" in each for each in found.warnings)
+    untold = np.full_like(straight.opening, np.nan)
+    found = find_rig(dataclasses.replace(straight, measured=leaking, opening=untold))
+    (said,) = found.warnings
+    assert "valve 3: it leaks" in said
+    assert "nan" not in said
     assert not found.contradictions
 
     opening = np.where(np.abs(straight.command[:, [0, 0, 1, 1]]) > 0, 0.3, 0.0)
     found = find_rig(dataclasses.replace(straight, opening=opening))
-    assert any("its inlet 27 % open" in each for each in found.warnings)
+    assert any("its inlet is 27 % open" in each for each in found.warnings)
 
     crossed = straight.measured[:, [1, 0, 2, 3]]
     found = find_rig(dataclasses.replace(straight, measured=crossed))

@@ -293,11 +293,13 @@ def _judge(log: RigLog, valve: int, fill: tuple[float, float], bends: Array) -> 
     if sensor is not None:
         pressure = log.measured[:, sensor]
         answered = _crossing(log.time, pressure, fill)
-        short = 1.0 - rise / wanted
+        short = wanted - rise
         opening = _level(log.time, log.opening, end)[valve]
-        if wanted - rise > max(LEAKS * wanted, SENSOR_ERROR) or opening > OPEN:
-            below = f"{100 * short:.0f} % below its command, its inlet {100 * opening:.0f} % open"
-            problems.append(f"it leaks or is fed too little: {below}")
+        if short > max(LEAKS * wanted, SENSOR_ERROR):
+            below = f"{short:.0f} Pa below its command"
+            problems.append(f"it leaks, is fed too little, or its sensor is off: {below}")
+        elif opening > OPEN:
+            problems.append(f"it leaks: its inlet is {100 * opening:.0f} % open")
         left = _change(log.time, pressure, (start, end + VENT))
         if left > STAYS * rise:
             problems.append(f"it does not vent: {left:.0f} Pa are left after {VENT:.0f} s")
