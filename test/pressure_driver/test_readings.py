@@ -99,6 +99,14 @@ def test_air_that_leaves_slowly_is_not_taken_for_rest(simulate):
     sim.run_until(lambda: sim.core.arm()[0], 4.0)
 
 
+def test_a_sensor_that_is_never_steady_is_named(simulate):
+    sim = simulate(seed=2)
+    for tick in range(100):
+        sim.board.pneumatics._gauge[1] = 300.0 * (tick % 2)
+        sim.tick()
+    assert "the readings of chamber 1 differ by" in sim.core.arm()[1]
+
+
 @pytest.mark.parametrize("protocol", NAMES)
 def test_chambers_that_disagree_are_not_at_rest(simulate, protocol):
     sim = simulate(protocol)

@@ -99,8 +99,8 @@ class RestPressures:
         window.append((now, reading))
         while now - window[0][0] > 1.5 * REST_TIME:
             window.popleft()
-        self.problem = self._unfit(reading)
-        if self.problem:
+        if problem := self._unfit(reading):
+            self.problem = problem
             window.clear()
             return
         half = len(window) // 2
@@ -109,8 +109,9 @@ class RestPressures:
             abs(fmean(values[half:]) - fmean(values[:half])) > self._largest_drift
             for values in chambers
         ):
-            self.problem = NOT_STEADY
+            self.problem = self.problem or NOT_STEADY
             return
+        self.problem = ""
         self.pressure = [fmean(values) for values in chambers]
         self.mean = fmean(self.pressure)
         self._lowest = list(map(min, self._lowest, self.pressure))
@@ -130,9 +131,12 @@ class RestPressures:
                 f"chambers read {least:.0f} to {most:.0f} Pa: vented they agree within "
                 f"{self.largest_offset:.0f} Pa"
             )
-        chambers = zip(*(each for _, each in self._window), strict=True)
-        if any(max(values) - min(values) > self._largest_spread for values in chambers):
-            return NOT_STEADY
+        for chamber, values in enumerate(zip(*(each for _, each in self._window), strict=True)):
+            if (spread := max(values) - min(values)) > self._largest_spread:
+                return (
+                    f"{NOT_STEADY}, and the readings of chamber {chamber} differ by {spread:.0f} Pa"
+                    f" (at most {self._largest_spread:.0f} Pa): look for air that leaves, or noise"
+                )
         higher = max(now - before for now, before in zip(newest, self._lowest, strict=True))
         if higher > self.largest_offset:
             return (
