@@ -169,7 +169,12 @@ def test_a_log_tells_what_the_model_lacks_of_a_free_limb(fitted):
 
 def test_a_limb_that_fits_passes_the_check_and_a_changed_one_does_not(fitted):
     limb, _ = fitted
-    assert check(limb, synthetic_log(hidden_limb(), seed=5, slow=True)).fits
+    log = synthetic_log(hidden_limb(), seed=5, slow=True)
+    assert check(limb, log).fits
+    short = check(limb, replace(log, commanded_differential=log.commanded_differential + 1500.0))
+    assert short.fits
+    by_pressures, by_commands = short.tip_error
+    assert by_commands > 5.0 * by_pressures
     drifted = hidden_limb()
     gains = [share * s.moment_gain for share, s in zip((0.8, 1.0), drifted.segments, strict=True)]
     verdict = check(limb, synthetic_log(with_segments(drifted, moment_gain=gains), slow=True))

@@ -15,6 +15,7 @@ from der_planner.identification.log import LEAST_MOTION, CalibrationLog, LogErro
 from der_planner.limb import Limb
 from der_planner.limb.parameters import REST_SPREAD
 from der_planner.model import CONTROL_PERIOD, Model, Response, simulate
+from der_planner.model.air import Air
 from der_planner.model.resting import weight_of
 
 GAIN_DRIFT = 0.08
@@ -248,7 +249,8 @@ class Check:
         fits: the limb need not be calibrated again.
         findings: sentences; empty where all is well.
         error: (M,) root mean square open-loop error of the bend angles [rad].
-        tip_error: mean distance of predicted and measured tips [m]; NaN without tips.
+        tip_error: mean distance of the tips that were measured and those that the measured
+            pressures, and the commands, let expect (2,) [m]; NaN without tips.
         gain_change: (M,) measured over predicted range of motion, less one; NaN for a segment that
             hardly moved.
         rest_change: (M,) mean of measured less predicted, at the gain that fits best [rad].
@@ -257,7 +259,7 @@ class Check:
     fits: bool
     findings: tuple[str, ...]
     error: Array
-    tip_error: float
+    tip_error: Array
     gain_change: Array
     rest_change: Array
 
@@ -272,8 +274,12 @@ class Check:
                 f"segment {index}: open-loop error rms {math.degrees(error):.2f}°, gain "
                 f"{change}, rest angle {math.degrees(rest):+.2f}°"
             )
-        if math.isfinite(self.tip_error):
-            lines.append(f"tip: mean error {1e3 * self.tip_error:.2f} mm")
+        if np.isfinite(self.tip_error).all():
+            held, asked = 1e3 * self.tip_error
+            lines.append(
+                f"tip: mean error {held:.2f} mm by the measured pressures, {asked:.2f} mm by the "
+                "commands: what is between them is of board, sensors and air"
+            )
         lines += [f"finding: {text}" for text in self.findings]
         lines.append(
             "the limb file fits" if self.fits else "the limb file does not fit: calibrate again"
@@ -312,8 +318,12 @@ def check(limb: Limb, log: CalibrationLog) -> Check:
                 f"the error of segment {index} is {math.degrees(error[index]):.2f}°, at its "
                 f"calibration it was {math.degrees(usual):.2f}°"
             )
-    distance = np.linalg.norm(prepared.log.tip - predicted.tip, axis=1)
-    tip_error = float(np.nanmean(distance)) if np.isfinite(distance).any() else math.nan
+    asked, tip = prepared.log.commanded_differential, prepared.log.tip
+    asked = np.where(np.isfinite(asked), asked, prepared.pressure)
+    held = Air(limb.pneumatics).pressures_at_commands(asked, CONTROL_PERIOD)
+    expected_tips = np.stack([predicted.tip, predict(limb, prepared.log.time, held).tip])
+    distance = np.linalg.norm(tip - expected_tips, axis=2)
+    tip_error = np.nanmean(distance, axis=1) if np.isfinite(tip).any() else np.full(2, math.nan)
     return Check(not drift, (*prepared.warnings, *drift), error, tip_error, gains, rests)
 
 
