@@ -74,6 +74,7 @@ def test_records_the_graph_between_start_and_stop(graph, tmp_path: Path):
         assert bag.run() == {"motion": "circle", "trial": 3}
         assert "/limb/camera/image_raw" not in bag.topics
         assert "/limb/moves/_action/feedback" not in bag.topics
+        assert "/limb/clock/questions" not in bag.topics
         assert "/diagnostics" in bag.topics
         assert bag.topics["/limb/latched"].latched
         assert not bag.topics["/limb/fast"].reliable

@@ -97,7 +97,7 @@ class Recorder(Node):
         declare("autostart", False, "start recording at once")
         declare("topics", ".*", "regular expression that the full topic names must match")
         left_out = "regular expression of full topic names to leave out; empty: none"
-        declare("exclude", ".*/image_annotated|.*/_.*", left_out)
+        declare("exclude", ".*/(image_annotated|clock/.*|_.*)", left_out)
         packed = "of the bag's chunks; auto: none with images, else zstd"
         declare("compression", "auto", packed, choices=("auto", *COMPRESSIONS))
         declare("flush_interval", 1.0, "time between flushes [s]", at_least=0.05, at_most=60.0)
