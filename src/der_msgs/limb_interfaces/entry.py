@@ -42,7 +42,7 @@ def run_module(name: str) -> int:
     if left := _outside_of_ros_args(sys.argv[1:]):
         print(
             f"'{' '.join(left)}' stands outside of --ros-args. Parameters are given as "
-            "--ros-args -p NAME:=VALUE; docs/reference/nodes.md names them",
+            "--ros-args -p NAME:=VALUE; while it runs, `ros2 param list` names them",
             file=sys.stderr,
         )
         return 0 if left in (["-h"], ["--help"]) else 2

@@ -103,15 +103,15 @@ class RestPressures:
             self.problem = problem
             window.clear()
             return
-        half = len(window) // 2
-        chambers = list(zip(*(each for _, each in window), strict=True))
-        if now - window[0][0] < REST_TIME or any(
-            abs(fmean(values[half:]) - fmean(values[:half])) > self._largest_drift
-            for values in chambers
-        ):
+        if now - window[0][0] < REST_TIME:
             self.problem = self.problem or NOT_STEADY
             return
-        self.problem = ""
+        half = len(window) // 2
+        chambers = list(zip(*(each for _, each in window), strict=True))
+        drifts = [abs(fmean(values[half:]) - fmean(values[:half])) for values in chambers]
+        self.problem = NOT_STEADY if max(drifts) > self._largest_drift else ""
+        if self.problem:
+            return
         self.pressure = [fmean(values) for values in chambers]
         self.mean = fmean(self.pressure)
         self._lowest = list(map(min, self._lowest, self.pressure))

@@ -229,8 +229,9 @@ def test_every_setpoint_is_sent_once_in_order_and_not_early(stage, short):
     stage.streamer.end_what_is_over()
     assert not stage.ended
     stage.now = schedule.stamp(schedule.count - 1)
-    stage.streamer.end_what_is_over()
+    stage.streamer.abandon(Ending("vented", "the run is over"))
     assert stage.ended == [("a", "finished")]
+    assert not stage.streamer.is_spent("a")
 
 
 def test_a_plan_that_begins_in_motion_takes_over_at_its_first_stamp(stage, short):

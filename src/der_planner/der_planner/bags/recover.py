@@ -159,7 +159,9 @@ def _bag_files(path: Path) -> list[Path]:
         return [path]
     found = sorted(path.glob("*.mcap"), key=lambda file: (len(file.name), file.name))
     if not found:
-        raise RecoverError(f"{path} holds no MCAP file; sqlite3: `ros2 bag reindex {path}`")
+        raise RecoverError(
+            f"{path} holds no MCAP file: no bag, or one of sqlite3 (`ros2 bag reindex {path}`)"
+        )
     return found
 
 

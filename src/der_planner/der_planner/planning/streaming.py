@@ -176,6 +176,7 @@ class Streamer:
     def abandon(self, ending: Ending) -> None:
         """Stop because of the driver, which takes no more setpoints of these plans."""
         with self.lock:
+            self.end_what_is_over()
             self._spent.update(schedule.plan_id for schedule in self._open)
             self.stop(ending.outcome, ending.reason)
 

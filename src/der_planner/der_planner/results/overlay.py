@@ -153,8 +153,8 @@ def write_video(run: RunSeries, path: Path) -> Path:
         write = _write_animation if path.suffix == ".webp" else _write_film
         if not write(run, path, frames):
             raise EvaluationError(
-                f"{path_of_bag}: no images of a known encoding; record them with "
-                "record_images:=true"
+                f"{path_of_bag}: no images of a known encoding: record them, by --record-images of "
+                "an experiment or record_images of the recorder"
             )
     return path
 
