@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from der_planner.commands import calibrate_limb, run_experiment
+from der_planner.commands import calibrate_limb, run_experiment, study
 from der_planner.experiment.processes import find_executable
 from der_planner.limb import Limb
 
@@ -91,11 +91,12 @@ def test_a_limb_unlike_the_twin_does_not_play_on_it(call, tmp_path):
         assert (found, "the twin has 2 segments and 0.244 m" in said) == (1, True)
 
 
-def test_two_experiments_do_not_share_a_folder(call, tmp_path):
+@pytest.mark.parametrize("words", [(run_experiment, "--offline"), (study, "accuracy")])
+def test_two_runs_of_a_command_do_not_share_a_folder(call, tmp_path, words):
     with (tmp_path / ".lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        found, _, said = call(run_experiment, "--offline", "--out", str(tmp_path))
-    assert (found, "is in use by another experiment" in said) == (2, True)
+        found, _, said = call(*words, "--out", str(tmp_path))
+    assert (found, "is in use by another run" in said) == (2, True)
 
 
 def test_pressures_beyond_the_limit_start_nothing(call, tmp_path):

@@ -14,14 +14,12 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import fcntl
 import hashlib
 import json
 import platform
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +28,7 @@ from der_planner.control import Learner, LearningError
 from der_planner.experiment.console import (
     OptionError,
     Progress,
+    alone_in,
     check_folder,
     command,
     interrupt_once,
@@ -136,7 +135,7 @@ def run(options: Options, progress: Progress | None = None) -> None:
     progress.say(
         f"{len(left)} of {len(trials)} trials to play on {_stage(options)}, into {options.out}"
     )
-    with _alone_in(options.out):
+    with alone_in(options.out):
         for place, trial in enumerate(trials, start=1):
             if trial in left:
                 progress.say(
@@ -145,25 +144,6 @@ def run(options: Options, progress: Progress | None = None) -> None:
                 )
                 _play_trial(trial, options, ledger, progress)
         _conclude(options, [each for trial in trials for each in ledger.runs_of(trial)], progress)
-
-
-@contextlib.contextmanager
-def _alone_in(folder: Path) -> Iterator[None]:
-    """Keep other experiments out of a folder.
-
-    Raises:
-        OptionError: one is in it.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    with (folder / ".lock").open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise OptionError(
-                f"--out {folder} is in use by another experiment: wait for its end, or choose "
-                "another folder"
-            ) from error
-        yield
 
 
 class Ledger:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import fcntl
 import functools
 import os
 import shutil
@@ -12,7 +13,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import FrameType
 
@@ -194,6 +195,25 @@ def _try_folder(path: Path, named: str) -> None:
             pass  # as root, and on read-only disks, only a trial tells
     except OSError as error:
         raise OptionError(f"{named} cannot be written: {error.strerror} in {present}") from error
+
+
+@contextlib.contextmanager
+def alone_in(folder: Path) -> Iterator[None]:
+    """Keep other commands that write their results there out of a folder, which is made.
+
+    Raises:
+        OptionError: one is in it.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / ".lock").open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise OptionError(
+                f"--out {folder} is in use by another run of this command: wait for its end, or "
+                "choose another folder"
+            ) from error
+        yield
 
 
 # Loads -------------------------------------------------------------------------------------------

@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 from distributed import Client, Future, LocalCluster
 from threadpoolctl import threadpool_limits
 
-from der_planner.experiment.console import Progress
+from der_planner.experiment.console import Progress, alone_in
 from der_planner.studies.factors import StudyError, Value
 from der_planner.studies.study import Row, Study
 from der_planner.studies.tasks import TASKS, Twin, calibrated, digest
@@ -66,6 +66,7 @@ def conduct(study: Study, settings: PlaySettings, progress: Progress) -> dict[st
 
     Raises:
         StudyError: the folder cannot be written, or no cluster can compute the rows.
+        OptionError: the folder is in use by another study.
         KeyboardInterrupt: it was stopped; what had come back is kept.
     """
     store = Store(settings.out, study)
@@ -88,7 +89,7 @@ def conduct(study: Study, settings: PlaySettings, progress: Progress) -> dict[st
         + (f" ({failed} of those done have failed)" if failed else "")
     )
     if missing:
-        with _cluster(settings) as client:
+        with alone_in(settings.out), _cluster(settings) as client:
             _Conductor(study, settings.scheduler, store, progress).play(client, missing)
     kept = store.load()
     return {row.key: kept[row.key] for row in rows if row.key in kept}
