@@ -123,6 +123,10 @@ def test_a_limb_that_swings_otherwise_than_its_model_is_followed_and_not_made_wo
     assert feedback.warnings[0].name == "swings"
     assert feedback.estimate(20.0).stiffness_ratio > 2.5
     assert fed.error.mean() < 0.7 * alone.error.mean()
+    # The next run knows how stiff it is: its corrections need not be slow.
+    again = Feedback(slow)
+    again.remember(feedback)
+    assert play(slow, Chain(), again).error.mean() < 0.6 * fed.error.mean()
 
 
 def test_feedback_and_learning_do_not_fight(planned):

@@ -110,13 +110,12 @@ class Feedback:
     def remember(self, earlier: Feedback) -> None:
         """Begin with what an earlier run of this limb has told of it.
 
-        That is how far the model is off where nothing touches the limb, its stiffness, what
-        corrections bring, and whether they swing.
+        That is how far the model is off where nothing touches the limb, its stiffness, and what
+        corrections bring.
         """
         self._estimator.remember(earlier._estimator)
         self._sense.free = earlier._sense.free.for_next_run()
         self._benefit.remember(earlier._benefit)
-        self._supervisor.swings = earlier._supervisor.swings
 
     def take_over(self, other: Feedback, time: float) -> None:
         """Go on where the feedback of another plan of this limb was, before anything is told.
