@@ -128,7 +128,9 @@ def touches(plan: Plan, filmed: Filmed) -> list[tuple[Touch, float]]:
     return list(found.values())
 
 
-def free_level(limb: Limb, time: Array, commands: Array, filmed: Filmed) -> str:
+def free_level(
+    limb: Limb, time: Array, commands: Array, filmed: Filmed, unlike: float = 0.0
+) -> str:
     """Return what a calibration run tells of the free level of its limb, for the limb file.
 
     Args:
@@ -136,6 +138,7 @@ def free_level(limb: Limb, time: Array, commands: Array, filmed: Filmed) -> str:
         time: (K,) every 50 ms from 0 on [s].
         commands: (K, M) then [Pa].
         filmed: of the run.
+        unlike: least deviation of tips from where bends put them [m].
 
     Returns:
         See `FreeLevel.told`.
@@ -148,7 +151,9 @@ def free_level(limb: Limb, time: Array, commands: Array, filmed: Filmed) -> str:
     tip, bend = response.tip[:-1], response.bend_angles[:-1]
     reference = Reference(time, tip, bend, resting_spline(time, bend), bend[0])
     plan = Plan(time, commands, reference, tip, bend, name, "der", name, 0.0, 0.0, 1, model, 0.0)
-    return _felt(plan, filmed)[0].free.told()
+    free = _felt(plan, filmed)[0].free
+    free.noise[-2:] = np.maximum(free.noise[-2:], unlike**2)
+    return free.told()
 
 
 def _felt(plan: Plan, filmed: Filmed) -> tuple[TouchSense, list[Touch]]:

@@ -130,14 +130,20 @@ def fit(
     return _fit(limb, log, groups, longest_gap, weight)
 
 
-def _with_free_level(limb: Limb, log: CalibrationLog) -> Limb:
-    """Return the limb with what the log tells of the free level, by which feedback feels touch."""
+def _with_free_level(limb: Limb, log: CalibrationLog, unlike: float) -> Limb:
+    """Return the limb with what the log tells of the free level, by which feedback feels touch.
+
+    Args:
+        limb: as it was identified.
+        log: of its run.
+        unlike: how far its tips are from where its bends put them, in any run [m].
+    """
     grid = log.between(log.time[0], log.time[0] + FREE_LEVEL_TOLD).resampled(CONTROL_PERIOD)
     time, held = grid.time - grid.time[0], grid.measured_differential
     asked = np.where(np.isfinite(grid.commanded_differential), grid.commanded_differential, held)
     filmed = Filmed(time, held, time, grid.bend_angles, grid.tip)
     try:
-        told = free_level(limb, time, np.nan_to_num(asked), filmed)
+        told = free_level(limb, time, np.nan_to_num(asked), filmed, unlike)
         return replace(limb, calibrated=replace(limb.calibrated, free_level=told))
     except (ValueError, ConvergenceError):  # no tips, or a limb that gives way
         return limb
@@ -165,7 +171,8 @@ def _fit(
     offset = 0.0 if air is None else air.offset
     prepared = replace(recorded, pressure=recorded.pressure - offset)
     fitted = _fit_bends_and_lengths(limb, prepared, groups, warnings)
-    warnings += filter(None, [lengths_at_their_end(limb, fitted.free.limb)])
+    at_end = lengths_at_their_end(limb, fitted.free.limb)
+    warnings += filter(None, [at_end])
     if hung is not None:
         change, deviation = hung.stiffness_change(fitted.free.limb, fitted.limb)
         moved, _ = told(fitted.problem, fitted.values)
@@ -195,7 +202,9 @@ def _fit(
     pcc_residual = np.full(limb.segment_count, np.nan)
     if limb.weighs_in_plane or any(term.group == "dynamics" for term in fitted.free.terms):
         found, pcc_residual = _with_arcs(found, fitted, prepared, warnings)
-    found = _with_free_level(found, log)
+    found = _with_free_level(
+        found, log, fitted.lengths.residual if at_end and fitted.lengths else 0.0
+    )
     return found, FitReport(
         limb=found,
         source=log.source,
