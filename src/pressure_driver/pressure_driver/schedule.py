@@ -256,10 +256,12 @@ class PublisherGate:
             return ""
         self.refused += 1
         if self._in_step:
-            return "two publishers count in step and cannot be told apart: stop one and arm again"
+            return "two publishers have counted in step: play one alone, and arm again"
         if before in self._others:
             self._others.remove(before)
         self._others.append((origin.topic, origin.number))
+        if origin.alone:
+            return f"the publisher on '{owner.topic}' that was heard first has ended: arm again"
         return f"another publisher on '{owner.topic}' is being played: stop it and arm again"
 
 

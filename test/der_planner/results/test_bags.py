@@ -148,7 +148,7 @@ def test_interrupted_run_says_so(tmp_path: Path):
     assert any("serial line lost" in text for text in result.problems)
     touched = [text for text in result.problems if "touched" in text]
     assert touched == ["something touched the limb from 0.80 s on, 0.3 N"]
-    assert any("not played" in text for text in result.problems)
+    assert any("end before the motion" in text for text in result.problems)
 
 
 def test_bag_without_plan_or_states_is_refused(tmp_path: Path):

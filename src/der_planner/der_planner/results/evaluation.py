@@ -205,7 +205,9 @@ def _problems(run: RunSeries, valid: float, longest: float) -> tuple[str, ...]:
     found = [f"the driver reported a fault: {text}" for text in run.faults]
     found += [f"something touched the limb {text}" for text in run.touches]
     if not run.finished:
-        found.append("the motion was not played or not recorded to its end")
+        found.append(
+            "setpoints or limb states end before the motion: was it stopped, or the tracker?"
+        )
     if valid < LEAST_VALID:
         found.append(f"only {valid:.0%} of the images have a valid limb state")
     if longest > GAP:
