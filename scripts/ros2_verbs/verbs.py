@@ -128,7 +128,7 @@ def topic_pub(options: argparse.Namespace) -> None:
         while not session.wait(lambda: publisher.get_subscription_count() >= wanted, 1.0):
             print(f"Waiting for at least {wanted} matching subscription(s)...")
         if options.wait_matching_subscriptions is None and times < math.inf:
-            session.wait(lambda: False, 0.5)  # other subscriptions may match a little later
+            session.discover()  # other subscriptions match a little later
         print("publisher: beginning loop")
         due, count = time.monotonic(), 0
         while count < times:

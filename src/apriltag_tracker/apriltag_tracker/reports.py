@@ -81,7 +81,7 @@ class ImageWatch(StreamWatch):
         if publishers == 0:
             return level, f"{text}: nobody publishes it; start the camera, or remap the topic"
         if level == "error":
-            return level, f"{text}, after {self.received}: see whether the camera's node still runs"
+            return level, f"{text}: see whether the camera's node still runs"
         return level, (
             f"{text} though it has {publishers} publisher(s): large images are lost with Fast "
             "DDS's default shared memory; set FASTRTPS_DEFAULT_PROFILES_FILE to "

@@ -128,9 +128,7 @@ def touches(plan: Plan, filmed: Filmed) -> list[tuple[Touch, float]]:
     return list(found.values())
 
 
-def free_level(
-    limb: Limb, time: Array, commands: Array, filmed: Filmed, unlike: float = 0.0
-) -> str:
+def free_level(limb: Limb, time: Array, commands: Array, filmed: Filmed, unlike: float) -> str:
     """Return what a calibration run tells of the free level of its limb, for the limb file.
 
     Args:

@@ -202,9 +202,8 @@ def _fit(
     pcc_residual = np.full(limb.segment_count, np.nan)
     if limb.weighs_in_plane or any(term.group == "dynamics" for term in fitted.free.terms):
         found, pcc_residual = _with_arcs(found, fitted, prepared, warnings)
-    found = _with_free_level(
-        found, log, fitted.lengths.residual if at_end and fitted.lengths else 0.0
-    )
+    unlike = fitted.lengths.residual if at_end and fitted.lengths else 0.0
+    found = _with_free_level(found, log, unlike)
     return found, FitReport(
         limb=found,
         source=log.source,
